@@ -49,20 +49,20 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
     assert code == 0, err
     with (tmp_path / "p.csv").open() as sheet:
         rows = list(csv.reader(sheet))
-    assert rows[0][1:] == list(rt.cases.armpi().classes)
+    assert rows[0][1:] == ["diagnosis", "reason", *rt.cases.armpi().classes]
     assert len(rows) == 91
     assert "macro_f1" not in out, "no labels, no scores"
     words = ("diagnose", "predict", tmp_path / "cnn", files / "real.npz")
     assert "macro_f1" in call(*words)[1]
     printed = json.loads(call(*words, "--json")[1])
-    assert printed.keys() == {"emulated", "trajectories", "scores"}
+    assert printed.keys() == {"emulated", "remark", "trajectories", "scores"}
     assert (printed["emulated"], len(printed["trajectories"]), printed["scores"]["n"]) == (
         True,
         90,
         90,
     )
     first = printed["trajectories"][0]
-    keys = {"id", "diagnosis", "probability", "probabilities", "label", "commands"}
+    keys = {"id", "diagnosis", "reason", "probability", "probabilities", "label", "commands"}
     assert first.keys() == keys
     assert first["probability"] == max(first["probabilities"].values())
     assert list(first["probabilities"]) == list(rt.cases.armpi().classes)
@@ -75,6 +75,21 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
     assert code == 0, err
     assert out.count("Healthy") >= 2
     assert "macro_f1" in out
+    assert "the bound of unknown comes from" in err
+    two = rt.load(tmp_path / "two.npz")
+    observed = two.observed.copy()
+    observed[0], observed[1] = np.nan, observed[1, ::-1] + 0.3
+    rt.save(two.replace(observed=observed, mask=None, labels=None), tmp_path / "lost.npz")
+    words = ("diagnose", "predict", tmp_path / "physics", tmp_path / "lost.npz")
+    code, out, err = call(*words, "--out", tmp_path / "lost.csv")
+    assert code == 0, err
+    with (tmp_path / "lost.csv").open() as sheet:
+        rows = list(csv.DictReader(sheet))
+    assert [row["diagnosis"] for row in rows] == ["unknown"] * 2
+    assert rows[0]["reason"] == "nothing was measured"
+    assert out.count("unknown") == 3, "the column of the probability, and two diagnoses"
+    found = json.loads(call(*words, "--json")[1])["trajectories"]
+    assert [each["diagnosis"] for each in found] == ["unknown"] * 2
 
 
 def test_same_seed_same_file(call, files: Path, tmp_path: Path) -> None:

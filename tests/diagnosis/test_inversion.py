@@ -14,7 +14,8 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 import retwin as rt
-from retwin.diagnosis import Diagnosis, InversionDiagnoser, fit_inversion
+from retwin.diagnosis import Calibration, Diagnosis, InversionDiagnoser, conclude, fit_inversion
+from retwin.diagnosis.inversion import UNEXPLAINED
 from retwin.diagnosis.inversion_fitting import lower_bound
 from retwin.diagnosis.severity import draw_biases
 from retwin.inference.losses import StudentT
@@ -245,6 +246,48 @@ def test_a_biased_actuator_may_also_miss_segments(toy_diagnoser: InversionDiagno
     away = np.abs(done - made.commands)[np.arange(12), stop, 1] > 0.1
     assert away.sum() >= 10
     assert (found.probabilities[away, 2] > 0.9).all()
+
+
+def test_no_evidence_is_unknown_with_the_reason(toy_diagnoser: InversionDiagnoser) -> None:
+    made = toy(4, "First stuck", 23)[0]
+    observed = made.observed.copy()
+    observed[0], observed[1, :, 2] = np.nan, np.nan
+    observed[2] = observed[2][:, [1, 2, 0]]
+    seen = made.mask & np.isfinite(observed)
+    found = toy_diagnoser.diagnose(made.replace(observed=observed, mask=seen))
+    assert found.labels.tolist() == ["unknown"] * 3 + ["First stuck"]
+    lost = made.outputs.names[2]
+    assert found.reason.tolist() == [
+        "nothing was measured",
+        f"{lost} never measured",
+        UNEXPLAINED,
+        "",
+    ]
+    said = conclude(toy_diagnoser, made)
+    assert said.labels.tolist() == ["First stuck"] * 4
+    assert "from 8 healthy trajectories: 0.01 of further ones are to be unknown" in said.remark
+    own = toy_diagnoser.calibration
+    assert (own.simulated, own.outputs) == (99, made.outputs.names)
+    assert own.below <= 9
+
+
+def test_foreign_data_are_unknown_after_one_run_too(tmp_path: Path) -> None:
+    """And healthy ones are not, of which the false rate is stated."""
+    plain, healthy = toy(60, "Healthy", 1)[0], toy(1, "Healthy", 2)[0]
+    training = Training(max_epochs=30, batch_size=64, learning_rate=1e-2)
+    ibg = rt.fit_surrogate(plain, rt.MLP((32,)), seed=0, training=training)
+    with pytest.warns(UserWarning, match="1 trajectories to calibrate on"):
+        residual = rt.fit_residual(ibg, healthy, rt.CommandSpace(), seed=0)
+    fit_inversion(ibg, residual, healthy, TOY).save(tmp_path / "one")
+    one = InversionDiagnoser.load(tmp_path / "one")
+    simulated = (99, one.calibration.below)
+    assert one.calibration == Calibration(1, 0.01, healthy.outputs.names, *simulated)
+    assert "From 1 of them foreign data cannot be recognised unless" in str(one.calibration)
+    further = toy(10, "Healthy", 31)[0]
+    o = further.observed
+    assert (one.diagnose(further).labels != "unknown").sum() >= 9
+    for foreign in (1.5 * o, np.roll(o, 1, axis=0), o[..., [1, 2, 0]]):
+        assert (one.diagnose(further.replace(observed=foreign)).labels == "unknown").sum() >= 9
 
 
 def test_a_fault_of_any_size_is_not_unknown(toy_diagnoser: InversionDiagnoser) -> None:

@@ -33,23 +33,26 @@ class Calibration:
         The largest share of healthy trajectories that is to be called unknown.
     outputs : tuple of str
         The outputs that were measured, without which a trajectory is unknown.
+    simulated, below : int
+        Healthy trajectories that the corrected twin simulated, and how many of them are unknown.
 
     """
 
     runs: int = 0
     false_rate: float = 0.01
     outputs: tuple[str, ...] = ()
+    simulated: int = 0
+    below: int = 0
 
     def __str__(self) -> str:
         if not self.runs:
             return "nothing is known of how often it calls a healthy trajectory unknown"
-        needed = round(1 / self.false_rate) - 1
+        few = self.runs < round(1 / self.false_rate) - 1
         text = (
-            f"at most {self.false_rate:.2g} of healthy trajectories are to be called unknown, by "
-            f"{self.runs} of calibration and {needed} that the corrected twin simulated"
+            f"the bound of unknown comes from {self.runs} healthy trajectories: "
+            f"{self.false_rate:.2g} of further ones are to be unknown{', which so few cannot show' if few else ''}; of "
+            f"{self.simulated} that the corrected twin simulates, {self.below} are"
         )
-        if self.runs < needed:
-            text += f"; fewer than {needed} real ones cannot show it"
         if self.runs < FEW:
             text += (
                 f". From {self.runs} of them foreign data cannot be recognised unless its errors "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import compress
 from typing import overload
 
@@ -27,16 +27,16 @@ from retwin.twins.faults import Fault
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Context
-from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.dynamics import DynamicsTwin, state_names
 from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
 from retwin.update.surrogate_error import surrogate_variance
 
-ERRORS = (3.0, 4.0)
-"""Errors of the outputs, over those in calibration, up to which no trajectory is called unknown,
-since calibration trajectories are explained better than others; and from which on each is."""
+ERRORS = 4.0
+"""Errors of the outputs, over those in calibration, from which on a trajectory is unknown: from few
+calibration trajectories, the quantile of a normal value is far away. None is unknown up to errors
+of 1 + ERRORS/n, if they are fewer, since the n of calibration are explained better than others."""
 ROUNDS = 5
 """Rounds of expectation-maximisation of the noise."""
 
@@ -93,8 +93,9 @@ def fit_inversion(
         held-out simulations.
     false_rate : float, default 0.01
         The largest share of healthy trajectories that is to be called unknown, from 0.001 to 0.5.
-        It holds for trajectories that the corrected twin simulates, and for those of the machine as
-        far as the calibration trajectories show it: fewer than 1/false_rate - 1 cannot.
+        Fewer than 1/false_rate - 1 calibration trajectories cannot show it: as many are simulated
+        by the corrected twin, and `InversionDiagnoser.calibration` has the number of them that is
+        called unknown.
 
     Raises
     ------
@@ -145,46 +146,50 @@ def fit_inversion(
     noise = fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS)
     seen = healthy.mask.any(axis=0).any(axis=0).tolist()
     outputs = tuple(compress(healthy.outputs.names, seen))
-    each, worse = _explained(residual, noise, context, observed, mask)
-    made = CorrectedTwin(surrogate, residual).simulate(
-        np.resize(healthy.commands, (round(1 / false_rate) - 1, *healthy.commands.shape[1:])),
-        seed=0,
-    )
-    simulated = DiagnosisInputs.of(surrogate, residual, made).with_error(variance)
+    limits = (1.0, min(ERRORS, 1 + ERRORS / len(healthy)), ERRORS)
+    each, near, far = _explained(residual, noise, (context, observed, mask), limits)
+    simulated = _simulated(surrogate, residual, healthy, noise, round(1 / false_rate) - 1)
+    others = DiagnosisInputs.of(surrogate, residual, simulated).with_error(variance)[:]
+    bound = min(max(lower_bound(each, false_rate), float(far.mean())), float(near.mean()))
+    below = _explained(residual, noise, others)[0] < bound
     return InversionDiagnoser(
         surrogate,
         residual,
         faults,
         noise=noise,
         surrogate_variance=variance,
-        bound=min(
-            float(_explained(residual, noise, *simulated[:])[0].min()),
-            max(lower_bound(each, false_rate), float(worse[1].mean())),
-            float(worse[0].mean()),
-        ),
-        calibration=Calibration(len(healthy), false_rate, outputs),
+        bound=bound,
+        calibration=Calibration(len(healthy), false_rate, outputs, len(below), int(below.sum())),
     )
 
 
 def _explained(
-    residual: ResidualModel, noise: Noise, context: Context, observed: Tensor, mask: Tensor
-) -> tuple[NDArray, list[NDArray]]:
-    """Evidence per sample (n,) of healthy trajectories; and if errors were `ERRORS` times as large.
-
-    Both state how well the healthy class explains the outputs, the second whatever their number.
-    """
-    rows = Hypotheses.of((None,), residual, context, observed, mask)
+    residual: ResidualModel,
+    noise: Noise,
+    given: tuple[Context, Tensor, Tensor],
+    factors: Sequence[float] = (1.0,),
+) -> list[NDArray]:
+    """Evidence per sample (n,) of healthy trajectories whose errors were so many times as large."""
+    rows = Hypotheses.of((None,), residual, *given)
     known = invert(rows, noise)
     problem = rows.problem.with_missed(known.fit.missed)
     errors = problem.residual(known.fit.x)
-    each = [known.evidence - _loss(noise, problem, factor * errors) for factor in (1.0, *ERRORS)]
-    samples = mask.any(dim=2).sum(dim=1).clamp_min(1)
-    lost = [(own - each[0] + known.evidence) / samples for own in each]
-    return lost[0].numpy(), [own.numpy() for own in lost[1:]]
+    lost = [noise.misfit(problem, factor * errors).sum(dim=1) for factor in factors]
+    samples = given[2].any(dim=2).sum(dim=1).clamp_min(1)
+    return [((known.evidence + lost[0] - each) / samples).numpy() for each in lost]
 
 
-def _loss(noise: Noise, problem: CommandProblem, errors: Tensor) -> Tensor:
-    return noise.misfit(problem, errors).sum(dim=1)
+def _simulated(
+    surrogate: Surrogate, residual: ResidualModel, healthy: Trajectories, noise: Noise, count: int
+) -> Trajectories:
+    """So many healthy trajectories of the corrected twin, with noise, measured as these were."""
+    place = np.arange(count) % len(healthy)
+    made = CorrectedTwin(surrogate, residual).simulate(healthy.commands[place], seed=0)
+    rng = np.random.default_rng(0)
+    # Gaussian noise of the same scale: that of Student's t would be larger than what was learned.
+    drawn = rng.standard_normal(made.observed.shape)
+    observed = made.observed + noise.scale.mean(dim=0).numpy() * drawn
+    return made.replace(observed=observed, mask=healthy.mask[place])
 
 
 def lower_bound(values: NDArray, false_rate: float = 0.01) -> float:

@@ -1,4 +1,4 @@
-"""`Portable`: a bundle's ONNX export, used with onnxruntime and numpy; torch is never imported."""
+"""`Portable`: a bundle's ONNX export, used with onnxruntime; torch is never imported."""
 
 from __future__ import annotations
 
