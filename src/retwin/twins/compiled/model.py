@@ -75,6 +75,33 @@ class Model:
             made[what] = ([node for node in needed if node.op in OPERATIONS], constants)
         return made
 
+    def delayed(self, delays: Sequence[tuple[int, int]]) -> Model:
+        """The model whose commands, of these indices, are delayed by parameters of these indices.
+
+        Its commands are those of `interpolation.delayed`.
+        """
+        program, count = Program(), len(self.variables["u"])
+        sizes = {letter: len(nodes) for letter, nodes in self.variables.items()}
+        variables = {
+            letter: tuple(program.variable(f"{letter}[{i}]") for i in range(size))
+            for letter, size in (sizes | {"u": count + len(delays)}).items()
+        }
+        known = {
+            node.index: made
+            for letter, nodes in self.variables.items()
+            for node, made in zip(nodes, variables[letter], strict=False)
+        }
+        for k, (place, parameter) in enumerate(delays):
+            moved = variables["p"][parameter] * variables["u"][count + k]
+            known[self.variables["u"][place].index] = variables["u"][place] + moved
+        for node in self.program.needed([*self.slope, *self.outputs]):
+            if node.op in OPERATIONS:
+                known[node.index] = program.node(node.op, *(known[a.index] for a in node.args))
+            elif node.op == "constant":
+                known[node.index] = program.constant(float(node.value))
+        slope, outputs = ([known[node.index] for node in own] for own in (self.slope, self.outputs))
+        return Model(program, variables, slope, outputs, self.discrete)
+
     @cached_property
     def source(self) -> str:
         """The model and its simulation in C99, without memory allocation."""
