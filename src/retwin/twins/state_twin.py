@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import at_least, one_of, require, whole
+from retwin.checks import at_least, finite, one_of, require, whole
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.times import sample_rate
@@ -21,7 +20,7 @@ from retwin.twins.limits import Limits
 from retwin.twins.parameter_values import values_per_simulation
 from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.saved_equations import equations_from, equations_of
-from retwin.twins.state import State
+from retwin.twins.state import State, check_delays
 from retwin.twins.step_error import warn_of_coarse_steps
 from retwin.twins.system_faults import parameter_changes
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
@@ -151,17 +150,7 @@ class StateTwin:
             got=f"substeps={self.substeps}, interpolation={self.interpolation!r}",
             remedy="leave both out: a step covers one sample period",
         )
-        own = {each.name: each for each in self.parameters}
-        for command, name in self.delays.items():
-            one_of("delays", command, self.inputs.names)
-            one_of("delays", name, tuple(own))
-            require(
-                own[name].unit == "s" and own[name].low >= 0,
-                "delays",
-                expected="a parameter in s with a lowest value of at least 0",
-                got=f"{name} in {own[name].unit}, from {own[name].low:g}",
-                remedy="give the parameter that unit and other bounds",
-            )
+        check_delays(self.delays, self.inputs.names, self.parameters)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """The equations as operations on numbers, since functions of any kind have these."""
@@ -204,7 +193,7 @@ class StateTwin:
             They cannot be traced, or return too few results.
 
         """
-        from retwin.twins.compiled.model import trace_model
+        from retwin.twins.compiled.model import trace_model, with_parameters
 
         function = self.step or self.derivative
         states, parameters = ([each.name for each in own] for own in (self.states, self.parameters))
@@ -344,14 +333,8 @@ class StateTwin:
         own = values_per_simulation(parameters, count, allowed=self.names)
         columns = zip(self.names, starts, strict=True)
         made = np.stack([own.get(name, np.full(count, start)) for name, start in columns], 1)
-        late = made[:, [place for _, place in self.delay_places]]
-        require(
-            (late >= 0).all(),
-            "parameters",
-            expected=f"dead times {', '.join(self.delays.values())} of at least 0 s",
-            got=f"{late.min(initial=0.0):g} s",
-            remedy="give the time by which a command acts later",
-        )
+        for _, place in self.delay_places:
+            finite(self.names[place], float(made[:, place].min(initial=0.0)), least=0.0)
         return made
 
     def changes(self, faults: Sequence[Fault | None], steps: int) -> NDArray:
@@ -418,23 +401,3 @@ class StateTwin:
         if self.step is None:
             finer, _ = self.steps(2 * self.substeps).run(commands, values)
             warn_of_coarse_steps(outputs[0], finer[0], self.outputs, self.substeps)
-
-
-def with_parameters(function: Callable[..., Any] | None) -> Callable[..., Any]:
-    """A function of x, u and p, where the user's may leave out p."""
-    require(
-        callable(function),
-        "output",
-        expected="functions of x, u and p",
-        got=repr(function),
-        remedy="give functions that can be called",
-    )
-    assert function is not None
-    places = [
-        each
-        for each in inspect.signature(function).parameters.values()
-        if each.default is each.empty and each.kind is not each.VAR_KEYWORD
-    ]
-    if len(places) == 2 and all(each.kind is not each.VAR_POSITIONAL for each in places):
-        return lambda x, u, p: function(x, u)
-    return function

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from collections import namedtuple
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from retwin.checks import require
 from retwin.compiler import c_source
 from retwin.twins.compiled.program import OPERATIONS, Node, Program
 from retwin.twins.compiled.trace import traced
@@ -229,3 +231,23 @@ def trace_model(
         letter: tuple(group) for letter, group in zip("xup", groups, strict=True)
     }
     return Model(program, variables, slope, made, discrete)
+
+
+def with_parameters(function: Callable[..., Any] | None) -> Callable[..., Any]:
+    """A function of x, u and p, where the user's may leave out p."""
+    require(
+        callable(function),
+        "output",
+        expected="functions of x, u and p",
+        got=repr(function),
+        remedy="give functions that can be called",
+    )
+    assert function is not None
+    places = [
+        each
+        for each in inspect.signature(function).parameters.values()
+        if each.default is each.empty and each.kind is not each.VAR_KEYWORD
+    ]
+    if len(places) == 2 and all(each.kind is not each.VAR_POSITIONAL for each in places):
+        return lambda x, u, p: function(x, u)
+    return function

@@ -116,7 +116,7 @@ def _with_best_delays(estimation: Estimation, found: Linearised) -> Linearised:
         return own.rest(replace(at, point=Point(at.point.shared[kept], at.point.starts)))
 
     for parameter in {place for _, place in twin.delay_places}:
-        for place in np.flatnonzero(unknowns.matrix[parameter]):
+        for place in np.flatnonzero(unknowns.matrix[parameter]).tolist():
             tried = [found]
             for value in delays_tried(unknowns.low[place], unknowns.high[place], twin.rate):
                 shared = found.point.shared.copy()
