@@ -91,11 +91,9 @@ def without_discrepancy(
         got="one that is not, at the present parameters",
         remedy="identify the twin first, or choose other starts of its parameters",
     )
-    estimation = replace(estimation, variance=estimation.power(found.residual))
-    found = _with_best_delays(estimation, found)
     for _ in range(ERROR_STEPS):
         estimation = replace(estimation, variance=estimation.power(found.residual))
-        found = estimation.minimised(found)
+        found = estimation.minimised(_with_best_delays(estimation, found))
     estimation = replace(estimation, variance=estimation.power(found.residual))
     combinations, there = estimation.confounded(found) / HELD, found.point.shared
 

@@ -163,7 +163,7 @@ class Search:
         robust = self.method.loss != "linear"
         found = []
         for done, start in enumerate(starts, 1):
-            found.append(self.descend(self._with_best_delays(start)))
+            found.append(self._from(start))
             if self.progress is not None:
                 self.progress(done / len(starts) * (0.5 if robust else 1.0))
         if robust:
@@ -178,6 +178,12 @@ class Search:
                     self.progress(0.5 + 0.5 * done / len(starts))
         optima = [self._optimum(*each) for each in zip(starts, found, strict=True)]
         return sorted(optima, key=lambda each: each[0].objective)
+
+    def _from(self, start: NDArray) -> OptimizeResult:
+        """The optimum from a start, whose dead times are the best before and after the search."""
+        found = self.descend(self._with_best_delays(start))
+        again = self._with_best_delays(found.x)
+        return self.descend(again) if (again != found.x).any() else found
 
     def _with_best_delays(self, point: NDArray) -> NDArray:
         """A point (k,) with the dead times from which a step of the others leaves least."""
