@@ -1,12 +1,13 @@
-"""`State`: a state of a model, and what is known of it at the first sample."""
+"""`State`: a state of a model, and what is known of it; and which parameters are dead times."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from retwin.checks import require
+from retwin.checks import one_of, require
 from retwin.twins.parametric import Parameter
 
 
@@ -54,3 +55,20 @@ class State:
         if self.low is None or self.high is None:
             return ()
         return (Parameter(f"start_{self.name}", self.unit, self.low, self.high, self.start),)
+
+
+def check_delays(
+    delays: Mapping[str, str], commands: Sequence[str], parameters: Sequence[Parameter]
+) -> None:
+    """Refuse dead times of unknown commands, and those that are no parameters in s from 0 on."""
+    own = {each.name: each for each in parameters}
+    for command, name in delays.items():
+        one_of("delays", command, commands)
+        parameter = own[one_of("delays", name, tuple(own))]
+        require(
+            parameter.unit == "s" and parameter.low >= 0,
+            "delays",
+            expected="a parameter in s whose lowest value is at least 0",
+            got=f"{name} in {parameter.unit}, from {parameter.low:g}",
+            remedy="give the parameter that unit and other bounds",
+        )

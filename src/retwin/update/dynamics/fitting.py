@@ -322,7 +322,7 @@ def _sizes(
     own, more = len(equations.twin.states), 2 if memory else 0
     first = len(found.shared) - len(equations.coefficients) - more
     psi = found.shared[first : len(found.shared) - more]
-    commands = estimation.commands.reshape(len(states), -1)
+    commands = estimation.acting(found).reshape(len(states), -1)
     values = equations.values(states[:, :own], commands, psi)
     sizes = np.abs(psi[equations.weights]) * np.sqrt(np.mean(values**2, axis=0))
     names = [equations.coefficients[place].name for place in equations.weights]
