@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 import torch
@@ -124,7 +125,9 @@ def _from_states(twin: DynamicsTwin, record: Trajectories, leads: Sequence[int])
     longest = min(max(leads), steps - 1)
     stride = max(1, count * steps // ORIGINS)
     row, origin = (each.ravel() for each in np.mgrid[:count, 0 : steps - 1 : stride])
-    past = TAPS  # earlier commands, on which a spline between samples depends
+    # Earlier commands, on which a spline between samples and dead times depend.
+    delays = [twin.values[place] for _, place in twin.equations.delay_places]
+    past = TAPS + ceil(max(delays, default=0.0) * record.rate) + 1
     place = np.clip(origin[:, None] + np.arange(-past, longest + 1), 0, steps - 1)
     theta = np.tile(twin.values, (len(row), 1))
     theta[:, -states.shape[2] :] = states[row, origin]

@@ -112,10 +112,6 @@ class Comparison:
             ratios.append((np.abs(self.errors(name, j)) / width).reshape(-1, len(self.spread)))
         return np.nanquantile(np.concatenate(ratios), LEVEL, axis=0) / USUAL
 
-    def factors(self, name: str) -> NDArray:
-        """Factors (d_y,) of a model's deviations with which bands hold what all folds show."""
-        return self._factor(name, len(self.folds))
-
     def diverged(self, name: str) -> bool:
         """Whether a simulation left any reasonable range."""
         return any(

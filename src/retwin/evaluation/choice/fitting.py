@@ -32,7 +32,7 @@ from retwin.update.corrections import Additive
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.forecast_errors import ForecastErrors
-from retwin.update.forecasts import LEADS, calibrate_forecasts, forecasts
+from retwin.update.forecasts import LEADS, calibrate_forecasts, forecasts, free_moments
 
 BASELINES = ("none", "parameters")
 """Candidates that correct nothing."""
@@ -242,7 +242,14 @@ def _calibrated(model: Model, comparison: Comparison, name: str, trials: Trials)
             own = comparison.records[fold.rows]
             made_at = forecasts(trials.models[name][i], own, leads)
             found.append((made_at, free.predicted[name][i].mean, own, fold.held[fold.rows]))
-    return widened(model, free.factors(name), calibrate_forecasts(found, leads))
+    forecast = calibrate_forecasts(found, leads)
+    own = free_moments(model, comparison.records.commands)[1]
+    size = np.sqrt(np.mean(np.where(comparison.records.mask, own, 0.0) ** 2, axis=(0, 1)))
+    share = np.sqrt(comparison.records.mask.mean(axis=(0, 1)))
+    factors = np.divide(
+        forecast.deviation[-1] * share, size, out=np.ones_like(size), where=size > 0
+    )
+    return widened(model, factors, forecast)
 
 
 def widened(model: Model, factors: NDArray, forecast: ForecastErrors) -> Model:
