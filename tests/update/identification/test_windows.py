@@ -42,7 +42,7 @@ def record(commands: np.ndarray, outputs: np.ndarray) -> rt.Trajectories:
     )
 
 
-def in_closed_loop(seed: int = 0, seconds: float = 40.0) -> rt.Trajectories:
+def in_closed_loop(seed: int = 0, seconds: float = 30.0) -> rt.Trajectories:
     """A cart under feedback, with friction and a slow force that no twin has."""
     rng, period = np.random.default_rng(seed), 1 / RATE
     x, v, force, aim = 0.3, 0.3, 0.0, 0.0

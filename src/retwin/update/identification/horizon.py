@@ -76,8 +76,8 @@ def lasting(twin: ParametricTwin, observed: Trajectories) -> bool:
         effect = (made[2] - made[0])[..., None].astype(np.float64)
     if not np.isfinite(effect).all():
         return True
-    size = np.sqrt(np.mean(effect**2, axis=1))
-    at_end = np.sqrt(np.mean(size[-max(1, last // LONGEST) :] ** 2, axis=0))
+    size = np.abs(effect).max(axis=1)
+    at_end = size[-max(1, last // LONGEST) :].max(axis=0)
     return bool((at_end > LASTING * size.max(axis=0)).any())
 
 
