@@ -329,7 +329,10 @@ class StateTwin:
 
     def values(self, parameters: Mapping[str, ArrayLike] | None, count: int) -> NDArray:
         """The values (count, k) of all parameters `names`."""
-        starts = [*(each.start for each in self.parameters), *(each.start for each in self.states)]
+        starts = [
+            *(each.start for each in self.parameters),
+            *(each.initial for each in self.states),
+        ]
         own = values_per_simulation(parameters, count, allowed=self.names)
         columns = zip(self.names, starts, strict=True)
         made = np.stack([own.get(name, np.full(count, start)) for name, start in columns], 1)
