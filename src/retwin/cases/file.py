@@ -34,6 +34,7 @@ from retwin.serialisation.configs import (
     from_settings,
     key,
 )
+from retwin.serialisation.places import real_path
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.fmu import FMUTwin
@@ -115,6 +116,8 @@ def read_case(path: str | Path) -> Case:
     rate = rate if isinstance(rate, int | float) else None
     keys = from_settings(CaseFile, settings, kinds, place=place, rate=rate)
     folder = home / keys.folder
+    with at(key(place, "folder")):
+        real_path(folder)
     twin = read_twin(keys.twin, keys.inputs, keys.outputs, keys.rate, folder, place)
     inside = key(place, "delays")
     tables = {f"delay_{name}": {"unit": "s", **each} for name, each in keys.delays.items()}

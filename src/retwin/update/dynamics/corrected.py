@@ -323,7 +323,7 @@ class CorrectedEquations:
 
 def _some(states: NDArray, commands: NDArray) -> tuple[NDArray, NDArray]:
     """At most so many samples (K, d_x) and (K, d_u) of states and commands."""
-    x, u = (each.reshape(-1, each.shape[2]) for each in (states, commands))
+    x, u = (each.reshape(np.prod(each.shape[:2]), each.shape[2]) for each in (states, commands))
     some = np.linspace(0, len(x) - 1, min(len(x), COMPARED)).astype(int)
     return x[some], u[some]
 

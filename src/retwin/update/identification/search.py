@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, differential_evolution, least_squares
 from scipy.stats.qmc import LatinHypercube
 
-from retwin.checks import one_of, whole
+from retwin.checks import one_of, require, whole
 from retwin.progress import Progress
 from retwin.twins.interpolation import delays_tried
 from retwin.update.identification.misfit import Misfit
@@ -172,6 +172,13 @@ class Search:
             middle = float(np.median(np.abs(best.fun[self.misfit.seen.ravel()])))
             self.loss = self.method.loss
             self.scale = max(1.4826 * middle, 1e-9 * self.misfit.spread)
+            require(
+                self.scale > 0,
+                "observed",
+                expected="outputs that change, or that the twin does not predict exactly",
+                got="outputs, measured and simulated, that never change and are equal",
+                remedy="give a record in which the system moves, and check its columns",
+            )
             for done, each in enumerate(found, 1):
                 found[done - 1] = self.descend(each.x)
                 if self.progress is not None:
