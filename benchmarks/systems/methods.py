@@ -1,0 +1,158 @@
+"""The methods: from a system to models by name, each of which a free simulation scores."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from systems.system import System
+
+import retwin as rt
+from retwin.evaluation import record_means, simulate_records
+from retwin.twins import StateTwin
+from retwin.update import DynamicsTwin, fit_black_box, fit_dynamics, fit_state_surrogate
+
+DRAWS = 200
+Models = Iterator[tuple[str, Any, str]]
+"""Names, models, and notes such as what was chosen."""
+
+
+class Constant:
+    """The mean of the calibration outputs, or the last value before the samples that are scored."""
+
+    def __init__(self, system: System, *, hold: bool) -> None:
+        seen = np.where(system.calibration.mask, system.calibration.observed, np.nan)
+        self.mean, self.hold = np.nanmean(seen, axis=(0, 1)), hold
+
+    def predict(self, record: rt.Trajectories, warm: int) -> NDArray:
+        """The same outputs (d_y,) at all samples."""
+        return record.observed[0, max(0, warm - 1)] if self.hold else self.mean
+
+
+def without_model(system: System) -> Models:
+    yield "constant", Constant(system, hold=False), ""
+    yield "hold", Constant(system, hold=True), ""
+    yield "twin", system.twin, ""
+
+
+def identified(system: System) -> rt.ParametricTwin:
+    return rt.identify(system.twin, system.calibration, seed=0).twin
+
+
+def output_correction(twin: rt.Twin, system: System) -> rt.CorrectedTwin:
+    density = rt.SequenceMixture()
+    residual = rt.fit_residual(twin, system.calibration, rt.Additive(), density, seed=0)
+    return rt.CorrectedTwin(twin, residual)
+
+
+def parameters(system: System) -> Models:
+    twin = identified(system)
+    yield "identified", twin, ", ".join(f"{k} {v:.3g}" for k, v in zip(twin.names, twin.values))
+    yield "output", output_correction(twin, system), ""
+
+
+def segments(system: System) -> Models:
+    twin = identified(system)
+    for name, correction in system.corrections.items():
+        residual = rt.fit_residual(twin, system.calibration, correction, seed=0)
+        yield name, rt.CorrectedTwin(twin, residual), ""
+
+
+def dynamics(system: System) -> Models:
+    twin = identified(system)
+    if not isinstance(twin.twin, StateTwin):
+        commands = system.calibration.commands
+        twin = fit_state_surrogate(twin, commands, system.calibration, seed=0).twin
+    fitted = fit_dynamics(twin, system.calibration)
+    yield "dynamics", fitted.twin, f"held out {fitted.figures['held_out']:.3g}"
+    yield "dynamics, output", output_correction(fitted.twin, system), ""
+
+
+def choice(system: System) -> Models:
+    fitted = rt.fit(system.twin, system.calibration, seed=0)
+    yield "fit", fitted.twin, fitted.chosen
+
+
+def black_box(kind: str) -> Any:
+    def fit(system: System) -> Models:
+        fitted = fit_black_box(system.calibration, kind, seed=0)
+        yield kind, fitted.twin, f"order {fitted.figures['order']:g}"
+
+    return fit
+
+
+JOBS = {
+    "without model": without_model,
+    "parameters": parameters,
+    "segments": segments,
+    "dynamics": dynamics,
+    "choice": choice,
+    **{kind: black_box(kind) for kind in ("arx", "narx", "neural_ss", "lstm")},
+}
+"""What is fitted together, in one process."""
+METHODS = {
+    "constant": "constant",
+    "hold": "hold last",
+    "twin": "twin",
+    "identified": "identified",
+    "delay/offset": "delay, offset",
+    "command space": "command space",
+    "output": "output",
+    "dynamics": "dynamics",
+    "dynamics, output": "dynamics, output",
+    "fit": "fit",
+    "arx": "linear OE",
+    "narx": "NARX",
+    "neural_ss": "neural SS",
+    "lstm": "LSTM",
+}
+"""The columns of the table, by name of the model."""
+
+
+def started(model: Any, warm: rt.Trajectories) -> Any:
+    """A model that begins as a record does, where its states have unknown starts."""
+    if isinstance(model, rt.CorrectedTwin):
+        return replace(model, surrogate=started(model.surrogate.twin, warm))
+    if isinstance(model, DynamicsTwin):
+        return model.started(warm)
+    free = [name for name in getattr(model, "names", ()) if name.startswith("start_")]
+    if not free:
+        return model
+    held = model.holding(*(name for name in model.names if name not in free))
+    return rt.identify(held, warm, seed=0).twin
+
+
+def score(model: Any, tests: rt.Trajectories, warm_up: float, scale: float) -> Mapping[str, float]:
+    """Scores of free simulation of the records: RMSE, CRPS, what 90 % bands hold, their width."""
+    warm = round(warm_up * tests.rate)
+    parts = []
+    for index in range(len(tests)):
+        record = tests[[index]]
+        if isinstance(model, Constant):
+            error = np.abs(record.observed - model.predict(record, warm))
+            none = np.full(error.shape, np.nan)
+            each = np.stack([error**2, error, none, none], -1)
+            each[~record.mask] = np.nan
+        else:
+            own = started(model, record.between(0, warm_up)) if warm else model
+            made = simulate_records(own, record, draws=DRAWS, seed=index)
+            width = np.where(record.mask, made.bands[:, -1] - made.bands[:, 0], np.nan)
+            square, crps, _, held, _ = np.moveaxis(made.per_sample(), -1, 0)
+            each = np.stack([square, crps, held, width if made.random else held], -1)
+        parts.append(each[:, warm:])
+    square, crps, held, width = record_means(np.concatenate(parts)).mean(axis=0)
+    return {
+        "rmse": scale * float(np.sqrt(square)),
+        "crps": scale * float(crps),
+        "coverage": float(held),
+        "width": scale * float(width),
+    }
+
+
+def quiet() -> None:
+    """Leave out warnings, which are for users, in a worker process of the benchmark."""
+    warnings.simplefilter("ignore")
