@@ -33,7 +33,7 @@ from retwin.processes import worker_pool
 from retwin.serialisation.files import write_atomically
 
 HERE = Path(__file__).parent
-LIMIT = 360.0
+LIMIT = 600.0
 """Longest duration of a job in s; what it has not fitted until then has no score."""
 SHARED = {"arx", "narx", "neural_ss", "lstm"}
 """Jobs and models without a twin, which are fitted once for systems with the same records."""
@@ -61,9 +61,9 @@ def write(file: Path, result: Mapping[str, Any]) -> None:
         part.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
-def run(names: list[str], data: Path, out: Path) -> None:
+def run(names: list[str], data: Path, out: Path, processes: int) -> None:
     """Do the jobs that are not done."""
-    with worker_pool(2) as pool:
+    with worker_pool(processes) as pool:
         futures: dict[tuple[str, str], Future] = {}
         for name in names:
             system = SYSTEMS[name](data)
@@ -182,10 +182,11 @@ def main() -> None:
     parser.add_argument("names", nargs="*", choices=[[], *SYSTEMS], metavar="NAME")
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("RETWIN_DATA", ".")))
     parser.add_argument("--out", type=Path, default=HERE.parent / "runs" / "systems")
+    parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--markdown", action="store_true")
     options = parser.parse_args()
     names = options.names or list(SYSTEMS)
-    run(names, options.data, options.out)
+    run(names, options.data, options.out, options.processes)
     rows = gathered(names, options.data, options.out)
     if options.markdown:
         print(markdown(rows))

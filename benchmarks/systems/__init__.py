@@ -5,9 +5,28 @@ A module has `SYSTEMS`, functions from the folder of the data to a `System`.
 
 from __future__ import annotations
 
-from systems import emps, exchanger, tanks
+from systems import (
+    arm,
+    cart,
+    drive,
+    emps,
+    exchanger,
+    incubator,
+    servo_logs,
+    silverbox,
+    tanks,
+    valve,
+)
 from systems.system import System
 
 __all__ = ["SYSTEMS", "System"]
 
-SYSTEMS = {**tanks.SYSTEMS, **exchanger.SYSTEMS, **emps.SYSTEMS}
+MODULES = (
+    *(arm, tanks, silverbox, incubator, exchanger, emps, servo_logs),
+    *(drive, cart, valve),
+)
+SYSTEMS = {
+    name: load
+    for module in MODULES
+    for name, load in module.SYSTEMS.items()
+}

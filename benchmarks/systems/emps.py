@@ -3,7 +3,8 @@
 From the motor's force to the position of a carriage; measured in closed loop, so that in open loop
 the twin is an integrator. The first record calibrates, that with pulses of the force tests. Both
 are thinned from 1 kHz to 200 Hz: forces are means over a sample, positions are at its begin. The
-twin has a mass, viscous friction and an offset; one of two has Coulomb friction too.
+twin has a mass, viscous friction and an offset; one of two has Coulomb friction too. Both records
+begin at rest at 0.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def position(x, u):
 
 def carriage(derivative, *further: rt.Parameter, substeps: int = 1) -> rt.ParametricTwin:
     return StateTwin(
-        [State("position", "m"), State("speed", "m/s", 0.0, -0.1, 0.1)],
+        [State("position", "m"), State("speed", "m/s")],
         position,
         rt.Channels(("force",), ("N",)),
         rt.Channels(("position",), ("m",)),
@@ -70,7 +71,6 @@ def emps(folder: Path, row: str, twin: rt.ParametricTwin) -> System:
         {row: records[1]},
         "mm",
         1000.0,
-        warm_up=0.5,
         published="9.1 IDIM-LS parameters in open loop",
         data="emps",
     )

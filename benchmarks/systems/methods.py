@@ -56,10 +56,14 @@ def parameters(system: System) -> Models:
 
 
 def segments(system: System) -> Models:
-    twin = identified(system)
+    twin = identified(system) if system.corrections else system.twin
     for name, correction in system.corrections.items():
         residual = rt.fit_residual(twin, system.calibration, correction, seed=0)
-        yield name, rt.CorrectedTwin(twin, residual), ""
+        model, note = rt.CorrectedTwin(twin, residual), ""
+        if system.hidden_truth and name == "command space":
+            (records,) = system.tests.values()
+            note = system.hidden_truth(model, records)
+        yield name, model, note
 
 
 def dynamics(system: System) -> Models:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,6 +34,8 @@ class System:
         Scores of others on the same test record, with their source.
     corrections : mapping of str to Correction
         Corrections per segment that suit the system.
+    hidden_truth : callable, optional
+        Scores of what a model in command space infers from the outputs of test records, as text.
     data : str
         Systems of the same name have the same records and differ in their twins.
 
@@ -47,6 +49,7 @@ class System:
     warm_up: float = 0.0
     published: str = ""
     corrections: Mapping[str, rt.Correction] = field(default_factory=dict)
+    hidden_truth: Callable[[rt.CorrectedTwin, rt.Trajectories], str] | None = None
     data: str = ""
 
 
