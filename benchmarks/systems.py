@@ -4,8 +4,9 @@
 
 NAME is a key of `systems.SYSTEMS`; by default all. Each method sees the calibration records alone
 and goes through the public interface with its defaults. Results are one JSON file per system and
-method in the folder OUT, those that are there are not made again; the whole table goes to
-benchmarks/results/systems.json. Two worker processes; a fit that takes longer than `LIMIT` ends.
+method in the folder OUT; those that are there are not made again; the whole table goes to
+benchmarks/results/systems.json. A job that needs more processor time than
+`LIMIT` ends.
 `--markdown` prints the tables of docs/results.md.
 """
 
@@ -14,10 +15,11 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
-from concurrent.futures import TimeoutError as LateError
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +27,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 from systems import SYSTEMS
-from systems.methods import JOBS, METHODS, quiet, score
+from systems.methods import JOBS, METHODS, score
 
 from retwin.cli.benchmark import machine
-from retwin.errors import InputError
 from retwin.processes import worker_pool
 from retwin.serialisation.files import write_atomically
 
 HERE = Path(__file__).parent
-LIMIT = 600.0
-"""Longest duration of a job in s; what it has not fitted until then has no score."""
+LIMIT = 300.0
+"""Longest processor time of a job in s; what it has not fitted until then has no score."""
 SHARED = {"arx", "narx", "neural_ss", "lstm"}
 """Jobs and models without a twin, which are fitted once for systems with the same records."""
 Rows = dict[str, dict[str, Any]]
@@ -43,7 +44,9 @@ Rows = dict[str, dict[str, Any]]
 
 def work(name: str, job: str, data: Path, out: Path) -> None:
     """Fit and score what one job makes of one system, a file for each model."""
-    quiet()
+    warnings.simplefilter("ignore")
+    signal.signal(signal.SIGPROF, late)
+    signal.setitimer(signal.ITIMER_PROF, LIMIT)
     system = SYSTEMS[name](data)
     spent, began = 0.0, time.process_time()
     for method, model, note in JOBS[job](system):
@@ -53,6 +56,11 @@ def work(name: str, job: str, data: Path, out: Path) -> None:
         ]
         write(out / name / f"{method}.json", {"scores": scores, "seconds": spent, "note": note})
         began = time.process_time()
+    signal.setitimer(signal.ITIMER_PROF, 0)
+
+
+def late(*_: Any) -> None:
+    raise TimeoutError(f"not within {LIMIT:g} s")
 
 
 def write(file: Path, result: Mapping[str, Any]) -> None:
@@ -71,15 +79,13 @@ def run(names: list[str], data: Path, out: Path, processes: int) -> None:
                 own = system.data if job in SHARED and system.data else name
                 if not (out / own / f"done {job}.json").exists():
                     args = (own, job, data, out)
-                    futures.setdefault((own, job), pool.schedule(work, args, timeout=LIMIT))
+                    futures.setdefault((own, job), pool.schedule(work, args))
         for (name, job), future in futures.items():
             try:
                 future.result()
                 reason = ""
-            except (InputError, AttributeError, RuntimeError, ValueError, KeyError) as error:
+            except Exception as error:
                 reason = f"{type(error).__name__}: {error}"
-            except LateError:
-                reason = f"not within {LIMIT:g} s"
             write(out / name / f"done {job}.json", {"reason": reason})
             Console().print(f"{name}, {job}: {reason or 'done'}", highlight=False)
 

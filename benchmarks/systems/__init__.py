@@ -25,8 +25,4 @@ MODULES = (
     *(arm, tanks, silverbox, incubator, exchanger, emps, servo_logs),
     *(drive, cart, valve),
 )
-SYSTEMS = {
-    name: load
-    for module in MODULES
-    for name, load in module.SYSTEMS.items()
-}
+SYSTEMS = {name: load for module in MODULES for name, load in module.SYSTEMS.items()}

@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from systems.system import System
 
 import retwin as rt
+from systems.system import System
 
 FOLDS = 3
 
@@ -24,14 +24,13 @@ def arm(folder: Path, fold: int) -> System:
     real = rt.load(folder / "armpi" / "real_a.mat", rate=case.twin.rate)
     real = case.recover(real[real.labels == "Healthy"], None)
     test = np.arange(len(real)) % FOLDS == fold
-    # The published figures are of the whole set, in which faults are diagnosed.
     return System(
         case.parametric,
         real[~test],
         {"arm": real[test]},
         "mm",
         1000.0,
-        corrections={"delay/offset": case.output_correction, "command space": case.correction},
+        case=case,
     )
 
 

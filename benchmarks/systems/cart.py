@@ -11,10 +11,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from systems.system import System, trajectory
 
 import retwin as rt
 from retwin.twins import State, StateTwin
+from systems.system import System, trajectory
 
 RATE, STEPS, SUBSTEPS = 20.0, 1200, 10
 MASS, NOISE, WIND, PERSISTENCE = 4.0, 0.002, 0.15, 3.0

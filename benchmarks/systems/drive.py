@@ -9,10 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from systems.system import System, trajectory
 
 import retwin as rt
 from retwin.twins import State, StateTwin
+from systems.system import System, trajectory
 
 RATE, STEPS, SUBSTEPS = 50.0, 3000, 20
 FRICTION, PLAY, NOISE = 30.0, 0.06, 0.004

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
 from scipy.io import loadmat
-from systems.system import System, trajectory
 
 import retwin as rt
 from retwin.twins import State, StateTwin
+from systems.system import System, trajectory
 
 EVERY = 5
 """Samples at 1 kHz per sample."""

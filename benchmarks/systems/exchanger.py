@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from systems.system import System, trajectory
 
 import retwin as rt
 from retwin.twins import State, StateTwin
+from systems.system import System, trajectory
 
 RATE = 1.0
 WARM_UP = 100.0

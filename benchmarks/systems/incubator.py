@@ -9,10 +9,9 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from systems.system import System
-
 from retwin.cases.styrofoam_incubator.case import WARM_UP, measurements
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
+from systems.system import System
 
 GUESS = {"c_air": 500.0, "g_box": 0.5, "c_heater": 50.0, "g_heater": 1.0}
 """Parameters before identification: those of the built-in twin have seen the first record."""
@@ -26,7 +25,9 @@ def incubator(folder: Path, index: int) -> System:
     after = (index + 1) % len(DAYS)
     row = f"incubator, {DAYS[index]} → {DAYS[after]}"
     tests = {row: records[after]}
-    return System(INCUBATOR.parametric().with_values(GUESS), records[index], tests, "K", warm_up=WARM_UP)
+    return System(
+        INCUBATOR.parametric().with_values(GUESS), records[index], tests, "K", warm_up=WARM_UP
+    )
 
 
 SYSTEMS = {f"incubator_{i + 1}": partial(incubator, index=i) for i in range(len(DAYS))}

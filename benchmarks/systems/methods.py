@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from systems.system import System
 
 import retwin as rt
 from retwin.evaluation import record_means, simulate_records
 from retwin.twins import StateTwin
 from retwin.update import DynamicsTwin, fit_black_box, fit_dynamics, fit_state_surrogate
+from systems.system import System
 
 DRAWS = 200
+PER_CLASS = 100
+"""Simulations of each class from which a surrogate learns."""
 Models = Iterator[tuple[str, Any, str]]
 """Names, models, and notes such as what was chosen."""
 
@@ -51,15 +52,24 @@ def output_correction(twin: rt.Twin, system: System) -> rt.CorrectedTwin:
 
 def parameters(system: System) -> Models:
     twin = identified(system)
-    yield "identified", twin, ", ".join(f"{k} {v:.3g}" for k, v in zip(twin.names, twin.values))
+    yield (
+        "identified",
+        twin,
+        ", ".join(f"{k} {v:.3g}" for k, v in zip(twin.names, twin.values, strict=True)),
+    )
     yield "output", output_correction(twin, system), ""
 
 
 def segments(system: System) -> Models:
-    twin = identified(system) if system.corrections else system.twin
-    for name, correction in system.corrections.items():
-        residual = rt.fit_residual(twin, system.calibration, correction, seed=0)
-        model, note = rt.CorrectedTwin(twin, residual), ""
+    """As in README: a surrogate of the twin as given, and corrections per segment."""
+    if system.case is None:
+        return
+    case = system.case
+    surrogate = rt.fit_surrogate(rt.generate(case.twin, case, per_class=PER_CLASS, seed=0), seed=0)
+    operators = {"delay/offset": case.output_correction, "command space": case.correction}
+    for name, operator in operators.items():
+        residual = rt.fit_residual(surrogate, system.calibration, operator, seed=0)
+        model, note = rt.CorrectedTwin(surrogate, residual), ""
         if system.hidden_truth and name == "command space":
             (records,) = system.tests.values()
             note = system.hidden_truth(model, records)
@@ -155,8 +165,3 @@ def score(model: Any, tests: rt.Trajectories, warm_up: float, scale: float) -> M
         "coverage": float(held),
         "width": scale * float(width),
     }
-
-
-def quiet() -> None:
-    """Leave out warnings, which are for users, in a worker process of the benchmark."""
-    warnings.simplefilter("ignore")

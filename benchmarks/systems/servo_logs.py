@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from systems.system import System
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC, RATE, UNIT
 from retwin.twins.command_side import CommandSide, command_side_parameters
+from systems.system import System
 
 STEPS = 1640
 MOTORS = (6, 5, 4, 3)
@@ -103,7 +103,7 @@ def servo_logs(folder: Path) -> System:
         {"arms, motor logs": records(tested)},
         "mm",
         1000.0,
-        corrections={"delay/offset": case.output_correction, "command space": case.correction},
+        case=case,
         hidden_truth=lambda model, tests: hidden_truth(model, tests, tested),
     )
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from systems.system import System
-
 import retwin as rt
 from retwin.cases.silver_box.twin import SILVERBOX
+from systems.system import System
 
 
 def silverbox(folder: Path) -> System:

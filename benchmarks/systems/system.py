@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,8 @@ class System:
         and which is not scored; 0 if the starts are those of the calibration.
     published : str
         Scores of others on the same test record, with their source.
-    corrections : mapping of str to Correction
-        Corrections per segment that suit the system.
+    case : Case, optional
+        The case of a system whose commands move and rest, with corrections per segment.
     hidden_truth : callable, optional
         Scores of what a model in command space infers from the outputs of test records, as text.
     data : str
@@ -48,7 +48,7 @@ class System:
     scale: float = 1.0
     warm_up: float = 0.0
     published: str = ""
-    corrections: Mapping[str, rt.Correction] = field(default_factory=dict)
+    case: rt.Case | None = None
     hidden_truth: Callable[[rt.CorrectedTwin, rt.Trajectories], str] | None = None
     data: str = ""
 

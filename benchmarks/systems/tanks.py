@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from systems.system import System
-
 import retwin as rt
 from retwin.cases.cascaded_tanks.twin import OVERFLOWING_TANKS, TANKS
+from systems.system import System
 
 PUBLISHED = (
     "0.34 nonlinear state space, 0.45 polynomial nonlinear state space (quoted in Mathematical "

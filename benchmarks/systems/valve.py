@@ -1,7 +1,7 @@
 """Emulated: a level behind a pipe, with dead time and a valve that saturates and is slow.
 
-The twin is a first-order lag with a gain; it lacks the dead time of the pipe, the valve's limits and
-its finite speed, and that the outflow is no linear function of the level. Two records of 500 s
+The twin is a first-order lag with a gain. It lacks the dead time of the pipe, the valve's limits
+and its finite speed, and that the outflow is no linear function of the level. Two records of 500 s
 calibrate, one tests.
 """
 
@@ -10,10 +10,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from systems.system import System, trajectory
 
 import retwin as rt
 from retwin.twins import State, StateTwin
+from systems.system import System, trajectory
 
 RATE, STEPS, SUBSTEPS = 4.0, 2000, 4
 DEAD_TIME, SPEED, NOISE = 2.3, 0.08, 0.01
