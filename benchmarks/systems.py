@@ -1,6 +1,6 @@
 """Every method on every system: free simulation of test records, in one table.
 
-    python benchmarks/systems.py [NAME ...] [--data FOLDER] [--out FOLDER] [--markdown]
+    python benchmarks/systems.py [NAME ...] [--data FOLDER] [--out FOLDER] [--show] [--markdown]
 
 NAME is a key of `systems.SYSTEMS`; by default all. Each method sees the calibration records alone
 and goes through the public interface with its defaults. Results are one JSON file per system and
@@ -34,7 +34,7 @@ from retwin.processes import worker_pool
 from retwin.serialisation.files import write_atomically
 
 HERE = Path(__file__).parent
-LIMIT = 300.0
+LIMIT = 180.0
 """Longest processor time of a job in s; what it has not fitted until then has no score."""
 SHARED = {"arx", "narx", "neural_ss", "lstm"}
 """Jobs and models without a twin, which are fitted once for systems with the same records."""
@@ -94,10 +94,17 @@ def gathered(names: list[str], data: Path, out: Path) -> Rows:
     """The scores that there are. Folds of a row are averaged, squares of its RMSE."""
     parts: dict[str, dict[str, list[dict[str, Any]]]] = {}
     about: Rows = {}
+    missing: dict[str, dict[str, str]] = {}
     for name in names:
         system = SYSTEMS[name](data)
         for index, row in enumerate(system.tests):
             about[row] = {"unit": system.unit, "published": system.published}
+            for job in JOBS:
+                own = system.data if job in SHARED and system.data else name
+                file = out / own / f"done {job}.json"
+                reason = json.loads(file.read_text("utf-8"))["reason"] if file.exists() else ""
+                if reason:
+                    missing.setdefault(row, {})[job] = reason
             for method in METHODS:
                 own = system.data if method in SHARED and system.data else name
                 file = out / own / f"{method}.json"
@@ -106,7 +113,9 @@ def gathered(names: list[str], data: Path, out: Path) -> Rows:
                     entry = found.pop("scores")[index] | found
                     parts.setdefault(row, {}).setdefault(method, []).append(entry)
     return {
-        row: about[row] | {"methods": {method: pooled(each) for method, each in methods.items()}}
+        row: about[row]
+        | {"methods": {method: pooled(each) for method, each in methods.items()}}
+        | {"missing": missing.get(row, {})}
         for row, methods in parts.items()
     }
 
@@ -179,7 +188,7 @@ def show(rows: Rows) -> None:
         console.print(table)
     for row, found in rows.items():
         notes = {name: each["note"] for name, each in found["methods"].items() if each["note"]}
-        lines = [f"  {name}: {note}" for name, note in notes.items()]
+        lines = [f"  {name}: {note}" for name, note in (notes | found["missing"]).items()]
         console.print(f"{row}; published: {found['published'] or '–'}", *lines, sep="\n")
 
 
@@ -189,10 +198,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("RETWIN_DATA", ".")))
     parser.add_argument("--out", type=Path, default=HERE.parent / "runs" / "systems")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--show", action="store_true", help="fit nothing, print what is there")
     parser.add_argument("--markdown", action="store_true")
     options = parser.parse_args()
     names = options.names or list(SYSTEMS)
-    run(names, options.data, options.out, options.processes)
+    if not options.show:
+        run(names, options.data, options.out, options.processes)
     rows = gathered(names, options.data, options.out)
     if options.markdown:
         print(markdown(rows))

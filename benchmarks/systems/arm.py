@@ -10,11 +10,34 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 import retwin as rt
+from retwin.cases.armpi_fpv.twin import KINEMATIC
 from systems.system import System
 
 FOLDS = 3
+
+
+class Kinematics:
+    """The arm's forward kinematics in torch: what corrections per segment need of a twin."""
+
+    memoryless = True
+    inputs, outputs, rate = KINEMATIC.inputs, KINEMATIC.outputs, KINEMATIC.rate
+    fitted = None
+
+    def __call__(self, commands: torch.Tensor) -> torch.Tensor:
+        """Positions (n, T, 3) for commands (n, T, 4)."""
+        angles = (commands - KINEMATIC.centre) * KINEMATIC.scale
+        links = torch.tensor(KINEMATIC.arm.links, dtype=commands.dtype)
+        yaw, pitch = angles[..., 0], angles[..., 1:].cumsum(dim=-1)
+        radius, height = pitch.sin() @ links, pitch.cos() @ links + KINEMATIC.arm.base
+        return torch.stack([yaw.sin() * radius, -yaw.cos() * radius, height], dim=-1)
+
+    def predict(self, commands: NDArray, progress: object = None) -> NDArray:
+        """The same for arrays."""
+        return KINEMATIC.position(np.asarray(commands, np.float64)).astype(np.float32)
 
 
 def arm(folder: Path, fold: int) -> System:
@@ -30,7 +53,8 @@ def arm(folder: Path, fold: int) -> System:
         {"arm": real[test]},
         "mm",
         1000.0,
-        case=case,
+        corrections={"delay/offset": case.output_correction, "command space": case.correction},
+        surrogate=Kinematics(),
     )
 
 

@@ -16,8 +16,6 @@ from retwin.update import DynamicsTwin, fit_black_box, fit_dynamics, fit_state_s
 from systems.system import System
 
 DRAWS = 200
-PER_CLASS = 100
-"""Simulations of each class from which a surrogate learns."""
 Models = Iterator[tuple[str, Any, str]]
 """Names, models, and notes such as what was chosen."""
 
@@ -61,15 +59,9 @@ def parameters(system: System) -> Models:
 
 
 def segments(system: System) -> Models:
-    """As in README: a surrogate of the twin as given, and corrections per segment."""
-    if system.case is None:
-        return
-    case = system.case
-    surrogate = rt.fit_surrogate(rt.generate(case.twin, case, per_class=PER_CLASS, seed=0), seed=0)
-    operators = {"delay/offset": case.output_correction, "command space": case.correction}
-    for name, operator in operators.items():
-        residual = rt.fit_residual(surrogate, system.calibration, operator, seed=0)
-        model, note = rt.CorrectedTwin(surrogate, residual), ""
+    for name, operator in system.corrections.items():
+        residual = rt.fit_residual(system.surrogate, system.calibration, operator, seed=0)
+        model, note = rt.CorrectedTwin(system.surrogate, residual), ""
         if system.hidden_truth and name == "command space":
             (records,) = system.tests.values()
             note = system.hidden_truth(model, records)

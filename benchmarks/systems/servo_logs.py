@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC, RATE, UNIT
 from retwin.twins.command_side import CommandSide, command_side_parameters
+from systems.arm import Kinematics
 from systems.system import System
 
 STEPS = 1640
@@ -103,7 +104,8 @@ def servo_logs(folder: Path) -> System:
         {"arms, motor logs": records(tested)},
         "mm",
         1000.0,
-        case=case,
+        corrections={"delay/offset": case.output_correction, "command space": case.correction},
+        surrogate=Kinematics(),
         hidden_truth=lambda model, tests: hidden_truth(model, tests, tested),
     )
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +33,10 @@ class System:
         and which is not scored; 0 if the starts are those of the calibration.
     published : str
         Scores of others on the same test record, with their source.
-    case : Case, optional
-        The case of a system whose commands move and rest, with corrections per segment.
+    corrections : mapping of str to Correction
+        Corrections per segment, of a system whose commands move and rest.
+    surrogate : object, optional
+        What stands in for the twin in these: the twin itself, differentiable.
     hidden_truth : callable, optional
         Scores of what a model in command space infers from the outputs of test records, as text.
     data : str
@@ -48,7 +51,8 @@ class System:
     scale: float = 1.0
     warm_up: float = 0.0
     published: str = ""
-    case: rt.Case | None = None
+    corrections: Mapping[str, rt.Correction] = field(default_factory=dict)
+    surrogate: Any = None
     hidden_truth: Callable[[rt.CorrectedTwin, rt.Trajectories], str] | None = None
     data: str = ""
 
