@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +35,16 @@ def derivative(x, u, p):
     return ((p.base + p.gain * u.flow - x.outlet) / p.lag,)
 
 
-def equations() -> rt.ParametricTwin:
-    outlet = State("outlet", "degC", 98.0, 85.0, 110.0)
-    options = {"derivative": derivative, "parameters": PARAMETERS}
-    return StateTwin([outlet], lambda x, u: x.outlet, *CHANNELS, RATE, **options).parametric()
+def equations(*further: rt.Parameter, **options: Any) -> rt.ParametricTwin:
+    return StateTwin(
+        [State("outlet", "degC", 98.0, 85.0, 110.0)],
+        lambda x, u: x.outlet,
+        *CHANNELS,
+        RATE,
+        derivative=derivative,
+        parameters=(*PARAMETERS, *further),
+        **options,
+    ).parametric()
 
 
 def lagged(commands: NDArray, base: float, gain: float, lag: float, dead_time: float) -> NDArray:
@@ -70,6 +77,11 @@ def exchanger(folder: Path, row: str, twin: rt.ParametricTwin) -> System:
 
 SYSTEMS = {
     "exchanger": lambda folder: exchanger(folder, "exchanger, equations", equations()),
+    "exchanger_dead_time": lambda folder: exchanger(
+        folder,
+        "exchanger, equations with dead time",
+        equations(DEAD_TIME, delays={"flow": "dead_time"}),
+    ),
     "exchanger_function": lambda folder: exchanger(folder, "exchanger, function", function()),
     "exchanger_function_dead_time": lambda folder: exchanger(
         folder, "exchanger, function with dead time", function(DEAD_TIME)

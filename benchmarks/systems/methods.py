@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,8 @@ from retwin.update import DynamicsTwin, fit_black_box, fit_dynamics, fit_state_s
 from systems.system import System
 
 DRAWS = 200
+AHEAD = (1, 10, 100)
+"""Samples ahead of the last measurement of which predictions are scored."""
 Models = Iterator[tuple[str, Any, str]]
 """Names, models, and notes such as what was chosen."""
 
@@ -79,7 +81,7 @@ def dynamics(system: System) -> Models:
 
 
 def choice(system: System) -> Models:
-    fitted = rt.fit(system.twin, system.calibration, seed=0)
+    fitted = rt.fit(system.twin, system.calibration, horizon=system.horizon, seed=0)
     yield "fit", fitted.twin, fitted.chosen
 
 
@@ -122,7 +124,8 @@ METHODS = {
 def started(model: Any, warm: rt.Trajectories) -> Any:
     """A model that begins as a record does, where its states have unknown starts."""
     if isinstance(model, rt.CorrectedTwin):
-        return replace(model, surrogate=started(model.surrogate.twin, warm))
+        inner = getattr(model.surrogate, "twin", None)
+        return model if inner is None else replace(model, surrogate=started(inner, warm))
     if isinstance(model, DynamicsTwin):
         return model.started(warm)
     free = [name for name in getattr(model, "names", ()) if name.startswith("start_")]
@@ -132,28 +135,59 @@ def started(model: Any, warm: rt.Trajectories) -> Any:
     return rt.identify(held, warm, seed=0).twin
 
 
-def score(model: Any, tests: rt.Trajectories, warm_up: float, scale: float) -> Mapping[str, float]:
-    """Scores of free simulation of the records: RMSE, CRPS, what 90 % bands hold, their width."""
-    warm = round(warm_up * tests.rate)
+def score(model: Any, system: System, tests: rt.Trajectories) -> Mapping[str, float]:
+    """RMSE, CRPS, what 90 % bands hold, and their width; RMSE some samples ahead."""
+    warm = round(system.warm_up * tests.rate)
+    later = {n: ahead(model, tests, n, warm) for n in AHEAD}
+    if system.horizon is None:
+        scores = free(model, tests, warm)
+    else:
+        scores = ahead(model, tests, round(system.horizon * tests.rate), warm)
+    found = dict(zip(("rmse", "crps", "coverage", "width"), scores, strict=True))
+    found |= {f"ahead {n}": each[0] for n, each in later.items()}
+    return {name: (1 if name == "coverage" else system.scale) * v for name, v in found.items()}
+
+
+def free(model: Any, tests: rt.Trajectories, warm: int) -> Sequence[float]:
+    """Scores of free simulation after the samples of the warm-up."""
     parts = []
     for index in range(len(tests)):
         record = tests[[index]]
         if isinstance(model, Constant):
-            error = np.abs(record.observed - model.predict(record, warm))
-            none = np.full(error.shape, np.nan)
-            each = np.stack([error**2, error, none, none], -1)
-            each[~record.mask] = np.nan
+            each = plain(
+                record, np.broadcast_to(model.predict(record, warm), record.observed.shape)
+            )
         else:
-            own = started(model, record.between(0, warm_up)) if warm else model
+            own = started(model, record.between(0, warm / record.rate)) if warm else model
             made = simulate_records(own, record, draws=DRAWS, seed=index)
             width = np.where(record.mask, made.bands[:, -1] - made.bands[:, 0], np.nan)
             square, crps, _, held, _ = np.moveaxis(made.per_sample(), -1, 0)
             each = np.stack([square, crps, held, width if made.random else held], -1)
         parts.append(each[:, warm:])
-    square, crps, held, width = record_means(np.concatenate(parts)).mean(axis=0)
-    return {
-        "rmse": scale * float(np.sqrt(square)),
-        "crps": scale * float(crps),
-        "coverage": float(held),
-        "width": scale * float(width),
-    }
+    square, *others = record_means(np.concatenate(parts)).mean(axis=0).tolist()
+    return np.sqrt(square), *others
+
+
+def plain(record: rt.Trajectories, outputs: NDArray) -> NDArray:
+    """Squared and absolute errors (n, T, d_y, 4) of outputs without bands."""
+    error = np.where(record.mask, np.abs(record.observed - outputs), np.nan)
+    none = np.full(error.shape, np.nan)
+    return np.stack([error**2, error, none, none], -1)
+
+
+def ahead(model: Any, tests: rt.Trajectories, samples: int, warm: int) -> Sequence[float]:
+    """Scores so many samples ahead of the last measurement; NaN where there are none."""
+    first = max(warm, samples)
+    if isinstance(model, Constant):
+        held = np.where(tests.mask, tests.observed, np.nan)[:, first - samples : -samples]
+        outputs = held if model.hold else np.broadcast_to(model.mean, held.shape)
+        later = tests.between(first / tests.rate, tests.steps / tests.rate)
+        square, *others = record_means(plain(later, outputs)).mean(axis=0).tolist()
+        return np.sqrt(square), *others
+    try:
+        options = {"horizon": samples / tests.rate, "warm_up": first / tests.rate}
+        rows = [row for row in rt.score_model(model, tests, **options) if row.who == "model"]
+    except (AttributeError, rt.InputError):  # a model that cannot be started from measurements
+        return (np.nan,) * 4
+    others = np.mean([[row.crps, row.coverage, row.width] for row in rows], axis=0)
+    return float(np.sqrt(np.mean([row.rmse**2 for row in rows]))), *others.tolist()

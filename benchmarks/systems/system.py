@@ -31,6 +31,9 @@ class System:
     warm_up : float
         Duration in s at the begin of a test record from which the starts of states are inferred,
         and which is not scored; 0 if the starts are those of the calibration.
+    horizon : float, optional
+        Time in s ahead of the last measurement at which models are judged; by default free
+        simulation, whose error grows without bound where a twin integrates.
     published : str
         Scores of others on the same test record, with their source.
     corrections : mapping of str to Correction
@@ -50,6 +53,7 @@ class System:
     unit: str
     scale: float = 1.0
     warm_up: float = 0.0
+    horizon: float | None = None
     published: str = ""
     corrections: Mapping[str, rt.Correction] = field(default_factory=dict)
     surrogate: Any = None
