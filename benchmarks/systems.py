@@ -19,6 +19,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -41,12 +42,18 @@ Rows = dict[str, dict[str, Any]]
 """By row of the table and method, with scores."""
 
 
+@cache
+def load(name: str, data: Path) -> System:
+    """A system; reading its records may take seconds."""
+    return SYSTEMS[name](data)
+
+
 def work(name: str, job: str, data: Path, out: Path, limit: float) -> None:
     """Fit and score what one job makes of one system, a file for each model."""
     warnings.simplefilter("ignore")
     signal.signal(signal.SIGPROF, late)
     signal.setitimer(signal.ITIMER_PROF, limit)
-    system = SYSTEMS[name](data)
+    system = load(name, data)
     spent, began = 0.0, time.process_time()
     for method, model, note in JOBS[job](system):
         spent += time.process_time() - began
@@ -71,7 +78,7 @@ def run(names: list[str], options: argparse.Namespace) -> None:
     out, futures = options.out, dict[tuple[str, str], Future]()
     with worker_pool(options.processes) as pool:
         for job, name in product(options.jobs or JOBS, names):
-            own = owner(SYSTEMS[name](options.data), name, job)
+            own = owner(load(name, options.data), name, job)
             if (own, job) not in futures and not finished(out / own / f"done {job}.json", options):
                 args = (own, job, options.data, out, options.limit)
                 futures[own, job] = pool.schedule(work, args)
@@ -106,7 +113,7 @@ def gathered(names: list[str], data: Path, out: Path) -> Rows:
     about: Rows = {}
     missing: dict[str, dict[str, str]] = {}
     for name in names:
-        system = SYSTEMS[name](data)
+        system = load(name, data)
         for index, row in enumerate(system.tests):
             about[row] = {"unit": system.unit, "published": system.published}
             for job in JOBS:
