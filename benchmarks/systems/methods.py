@@ -178,6 +178,8 @@ def plain(record: rt.Trajectories, outputs: NDArray) -> NDArray:
 def ahead(model: Any, tests: rt.Trajectories, samples: int, warm: int) -> Sequence[float]:
     """Scores so many samples ahead of the last measurement; NaN where there are none."""
     first = max(warm, samples)
+    if first >= tests.steps:
+        return (np.nan,) * 4
     if isinstance(model, Constant):
         held = np.where(tests.mask, tests.observed, np.nan)[:, first - samples : -samples]
         outputs = held if model.hold else np.broadcast_to(model.mean, held.shape)
