@@ -408,6 +408,13 @@ SOURCES: Mapping[str, SourceEntry] = {
         twin="retwin.study.sources:black_box",
         simulates=True,
     ),
+    "lstm": SourceEntry(
+        "LSTM",
+        "healthy",
+        (("update", "lstm"),),
+        twin="retwin.study.sources:black_box",
+        simulates=True,
+    ),
     "ibg_rg_command": SourceEntry(
         "Updated twin (command space)",
         "healthy",
