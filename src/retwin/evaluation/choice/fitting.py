@@ -98,7 +98,7 @@ def fit(
     preferred, differences = comparison.simplest()
     chosen = settings.method or preferred
     model = trials.final(chosen)
-    model = _calibrated(model, comparison, chosen, trials)
+    model = _calibrated(model, trials, chosen)
     scores = _scores(trials, comparison, differences)
     predicted, deviation = _shown(comparison, chosen)
     found = Fitted(
@@ -222,33 +222,22 @@ class Trials:
         return self.whole.fits[name]()
 
 
-def _calibrated(model: Model, comparison: Comparison, name: str, trials: Trials) -> Model:
+def _calibrated(model: Model, trials: Trials, name: str) -> Model:
     """The model with bands that hold what the parts in time show."""
-    leads = [each for each in LEADS if 4 * each <= comparison.records.steps]
-    found = []
-    if name not in comparison.predicted:
+    records, found = trials.whole.records, []
+    if name in trials.reasons:
         return model
-    free = comparison
-    if trials.whole.settings.horizon is not None:
-        made = {
-            name: [
-                predict(own, comparison.records, fold, None)
-                for own, fold in zip(trials.models[name], comparison.folds, strict=True)
-            ]
-        }
-        free = Comparison(comparison.records, comparison.folds, made)
-    for i, fold in enumerate(comparison.folds):
+    leads = [each for each in LEADS if 4 * each <= records.steps]
+    for one, fold in zip(trials.models[name], trials.folds, strict=True):
         if not fold.edge:
-            own = comparison.records[fold.rows]
-            made_at = forecasts(trials.models[name][i], own, leads)
-            found.append((made_at, free.predicted[name][i].mean, own, fold.held[fold.rows]))
+            own = records[fold.rows]
+            free = free_moments(one, own.commands)[0]
+            found.append((forecasts(one, own, leads), free, own, fold.held[fold.rows]))
     forecast = calibrate_forecasts(found, leads)
-    own = free_moments(model, comparison.records.commands)[1]
-    size = np.sqrt(np.mean(np.where(comparison.records.mask, own, 0.0) ** 2, axis=(0, 1)))
-    share = np.sqrt(comparison.records.mask.mean(axis=(0, 1)))
-    factors = np.divide(
-        forecast.deviation[-1] * share, size, out=np.ones_like(size), where=size > 0
-    )
+    deviation = np.where(records.mask, free_moments(model, records.commands)[1], np.nan)
+    with np.errstate(invalid="ignore"):
+        size = np.sqrt(np.nanmean(deviation**2, axis=(0, 1)))
+    factors = np.divide(forecast.deviation[-1], size, out=np.ones_like(size), where=size > 0)
     return widened(model, factors, forecast)
 
 
