@@ -96,6 +96,8 @@ Yardstick = Annotated[
         "--yardstick/--no-yardstick", help="Compare with models without the twin, once saved."
     ),
 ]
+LARGEST = 8
+"""Number of terms of the state equations that are printed."""
 METHODS = {"additive": "output", "delay_offset": "delay_offset", "command_space": "segments"}
 """The candidate that a correction, given by its name, stands for."""
 
@@ -390,6 +392,12 @@ def _print(found: Fitted, twin: Twin, out: Path, *, as_json: bool) -> None:
     if parameters:
         titles = ("parameter", "before", "identified", "in the model")
         shown += [table(titles, parameters, numbers=titles[1:]), ""]
+    if found.learned is not None:
+        terms = [
+            (each, f"{size:.3f}") for each, size in list(found.learned.terms.items())[:LARGEST]
+        ]
+        text = "The largest terms of the state equations, over the usual derivative of their state:"
+        shown += [text, table(("term", "size"), terms, numbers=("size",)), ""]
     failed = [f"{each.title}: {each.reason}" for each in found.scores if each.reason]
     answer({"saved": str(out), **found.values}, *shown, *found.remarks, *failed, as_json=as_json)
     note(f"Saved {out}, with the comparison in {out / 'report.html'}")

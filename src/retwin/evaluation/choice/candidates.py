@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from retwin.data.segments import Segments
@@ -15,7 +15,7 @@ from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive, Correction, DelayOffset
-from retwin.update.dynamics import DynamicsTwin, fit_dynamics, state_names
+from retwin.update.dynamics import DynamicsTwin, FittedDynamics, fit_dynamics, state_names
 from retwin.update.identification import LeastSquares, Updated, identify
 from retwin.update.residual import StationaryNoise, fit_residual
 
@@ -95,9 +95,14 @@ class Candidates:
         return self.twin if self.updated is None else self.updated.twin
 
     @cached_property
+    def learned(self) -> FittedDynamics:
+        """Corrected state equations, and what they learned."""
+        return fit_dynamics(self.identified, self.records, self.settings.dynamics)  # type: ignore[arg-type]
+
+    @property
     def dynamics(self) -> DynamicsTwin:
         """Corrected state equations."""
-        return fit_dynamics(self.identified, self.records, self.settings.dynamics).twin  # type: ignore[arg-type]
+        return replace(self.learned.twin, case=self.case)
 
     def none(self) -> CorrectedTwin:
         """The twin as it is, with its errors as noise."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.files import read_json, write_json
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.dynamics import DynamicsTwin
+from retwin.update.dynamics import DynamicsTwin, FittedDynamics
 
 FILE = "choice.json"
 """The comparison, in the folder of the model."""
@@ -83,6 +83,8 @@ class Fitted:
     measured, predicted, deviation : NDArray
         (n, T, d_y): the records, and the chosen candidate's predictions of the parts in time that
         were left out; NaN elsewhere.
+    learned : FittedDynamics or None
+        What corrected state equations learned; None where the twin has none.
     seconds : float
         Duration.
 
@@ -99,6 +101,7 @@ class Fitted:
     records: Trajectories
     predicted: NDArray
     deviation: NDArray
+    learned: FittedDynamics | None
     seconds: float
 
     def score(self, name: str) -> CandidateScore:
@@ -120,7 +123,27 @@ class Fitted:
             "remarks": list(self.remarks),
             "parameters": {name: list(each) for name, each in self.parameters.items()},
             "seconds": self.seconds,
+            "dynamics": self._learned,
+            "residual": self._residual,
         }
+
+    @property
+    def _learned(self) -> dict[str, Any] | None:
+        found = self.learned
+        if found is None:
+            return None
+        correlations = [[*pair, each] for pair, each in found.correlations.items()]
+        errors = {name: _finite(each) for name, each in found.errors.items()}
+        names = ("parameters", "terms", "figures", "reason")
+        own = {name: getattr(found, name) for name in names}
+        return own | {"errors": errors, "correlations": correlations}
+
+    @property
+    def _residual(self) -> dict[str, Any] | None:
+        if not isinstance(self.twin, CorrectedTwin) or self.twin.residual.fitted is None:
+            return None
+        fitted = self.twin.residual.fitted
+        return {"figures": fitted.figures, "reason": fitted.reason}
 
     def save(self, folder: str | Path) -> None:
         """Write the twin as `rt.load_twin` reads it, with the comparison beside it."""

@@ -113,6 +113,7 @@ def fit(
         records=records,
         predicted=predicted,
         deviation=deviation,
+        learned=whole.learned if "learned" in vars(whole) else None,
         seconds=time.perf_counter() - began,
     )
     return with_yardstick(found, seed=seed) if settings.yardstick else found
