@@ -23,6 +23,7 @@ from retwin.evaluation.choice.folds import Fold, folds_of
 from retwin.evaluation.choice.remarks import remarks_of, without_twin
 from retwin.evaluation.choice.settings import Choice
 from retwin.progress import Progress
+from retwin.threads import one_thread
 from retwin.twins.collected import SimulationError
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Twin, check_channels
@@ -86,8 +87,20 @@ def fit(
         or no candidate that can be fitted.
 
     """
+    with one_thread():  # fits are small, and threads that wait for each other take longer
+        return _fit(twin, _healthy(records), settings, seed, case, original, progress)
+
+
+def _fit(
+    twin: Twin,
+    records: Trajectories,
+    settings: Choice,
+    seed: int,
+    case: str,
+    original: Twin | None,
+    progress: Progress | None,
+) -> Fitted:
     began = time.perf_counter()
-    records = _healthy(records)
     check_channels(twin, records, "records")
     whole = Candidates(twin, records, settings, seed, case, original)
     names = _names(whole, settings)
@@ -165,7 +178,7 @@ class Trials:
         total, done = len(self.names) * len(self.folds) + len(self.names), 0
         for fold in self.folds:
             training = fold.training(self.whole.records)
-            own = replace(self.whole, records=training)
+            own = replace(self.whole, records=training, settings=self.whole.settings.lighter)
             fits = own.fits
             for name in self.names:
                 if name not in self.reasons:

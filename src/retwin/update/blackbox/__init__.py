@@ -12,6 +12,7 @@ import numpy as np
 from retwin.checks import one_of
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
+from retwin.threads import one_thread
 from retwin.twins.twin import checked_seed
 from retwin.update.blackbox.arx import fit_arx
 from retwin.update.blackbox.estimate import BlackBox
@@ -30,6 +31,7 @@ BLACK_BOXES: Mapping[str, Callable[[Trajectories, int, Progress | None], BlackBo
 """By name, which is that of the source in a study too."""
 
 
+@one_thread()
 def fit_black_box(
     observed: Trajectories, kind: str, *, seed: int = 0, progress: Progress | None = None
 ) -> BlackBox:

@@ -16,6 +16,7 @@ from retwin.checks import require
 from retwin.data.measured import doubtful, unmeasured
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
+from retwin.threads import one_thread
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
@@ -91,6 +92,7 @@ class FittedDynamics:
         return None
 
 
+@one_thread()
 def fit_dynamics(
     twin: StateTwin | ParametricTwin,
     observed: Trajectories,
