@@ -36,7 +36,7 @@ def record(name: str, title: str, rows: dict[str, float] | dict[str, dict[str, f
     for what, row in several.items():
         table.add_row(what, *(f"{value:.3g}" for value in row.values()))
     Console().print(table)
-    store(name, {"title": title, "machine": machine(), "rows": _rounded(rows)})
+    store(name, {"title": title, "machine": machine(), "rows": rounded(rows)})
 
 
 def store(name: str, result: dict[str, Any]) -> None:
@@ -47,7 +47,12 @@ def store(name: str, result: dict[str, Any]) -> None:
         part.write_text(json.dumps(every, indent=1) + "\n", encoding="utf-8")
 
 
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
+    """Numbers with four digits, None for those that are not finite, which JSON does not have."""
     if isinstance(value, dict):
-        return {name: _rounded(each) for name, each in value.items()}
-    return float(f"{value:.4g}") if isfinite(value) else None  # as JSON has only finite numbers
+        return {name: rounded(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [rounded(each) for each in value]
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.4g}") if isfinite(value) else None

@@ -90,9 +90,9 @@ TANKS = StateTwin(
     substeps=SUBSTEPS,
     limits=Limits((0.0,), (10.0,)),
 )
-"""The simple twin, fitted by least squares to the benchmark's estimation record, see
-`benchmarks/tanks.py`. The lower level determines the upper level and its start only weakly. Starts
-are the system's own, the same in every record."""
+"""The simple twin, fitted by least squares to the benchmark's estimation record. The lower level
+determines the upper level and its start only weakly. Starts are the system's own, the same in every
+record."""
 
 OVERFLOWING_TANKS = StateTwin(
     _levels(30.0),
