@@ -142,6 +142,13 @@ fmi3Status fmi3DoStep(fmi3Instance p, fmi3Float64 t, fmi3Float64 h, fmi3Boolean 
         char zeros[4096] = {0}, numbers[4] = {0, 0, 1, 0};
         if (write(i, i % 2 ? zeros : numbers, i % 2 ? 4096 : 4)) continue;
     }
+    if (s->trouble == 118) for (int i = 0; i < 4; i++) {
+        pid_t child = fork();
+        if (!child) for (;;) pause();
+        FILE *file = fopen(getenv("LAG_FORKS"), "a");
+        if (file) { fprintf(file, "%d\n", (int)child); fclose(file); }
+    }
+    if (s->trouble == 119) s->x = 1e308;
     double target = s->on ? s->gain * s->u : 0;
     s->x = target + (s->x - target) * exp(-h / s->tau);
     s->sums[0] += s->pair[0] * s->fixed;

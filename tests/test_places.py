@@ -25,7 +25,10 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (Path("full") / "other").touch()
 
 
-@pytest.mark.parametrize("name", ["/", "", "file", "/proc/none", "file/a", LONG, f"a/{LONG}"])
+NAMES = ["/", "", "file", "/proc/none", "file/a", LONG, f"a/{LONG}", "a\0b"]
+
+
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("folder", [False, True])
 def test_what_cannot_be_written_is_refused_and_nothing_is_made(name: str, folder: bool) -> None:
     free = (name, folder) in (("file", False), ("", True))
@@ -52,6 +55,35 @@ def test_a_folder_that_passes_is_written(name: str) -> None:
 def test_devices_are_not_replaced() -> None:
     with pytest.raises(InputError, match="got /dev/null, which is none"):
         check_place("/dev/null")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files")
+@pytest.mark.parametrize("name", ["full.npz", "full.zarr"])
+def test_a_full_disk_is_named(name: str) -> None:
+    code = (
+        "import resource, numpy as np, retwin as rt\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+        "noise = np.random.default_rng(0).normal(size=(10, 900, 1))\n"
+        f"rt.save(rt.Trajectories(noise, noise, noise, 10.0), '{name}')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    message = done.stderr.strip().rpartition("\n")[2]
+    assert (
+        f"InputError: path: expected a place that can be written, got {Path(name).resolve()} ("
+        in message
+    )
+    assert not Path(name).exists()
+
+
+def test_what_another_process_has_made_meanwhile_stays() -> None:
+    with (
+        pytest.raises(InputError, match="new, which one writes to now"),
+        write_atomically("new", folder=True, replace=False) as part,
+    ):
+        (part / "a").touch()
+        Path("new").mkdir()
+        (Path("new") / "b").touch()
+    assert [each.name for each in Path("new").iterdir()] == ["b"]
 
 
 def test_fit_may_replace_what_it_wrote(updated: rt.CorrectedTwin) -> None:

@@ -65,6 +65,7 @@ _HOME = {
     "CNN": "nets.networks",
     "Case": "cases.case",
     "Chain": "update.corrections",
+    "Choice": "evaluation",
     "Channels": "data.trajectories",
     "CommandSpace": "update.corrections",
     "Context": "update.corrections",
@@ -108,6 +109,7 @@ _HOME = {
     "evaluate": "evaluation.diagnosers",
     "export_actuator": "deploy.actuator.export",
     "fetch": "data.download",
+    "fit": "evaluation",
     "fit_diagnoser": "diagnosis",
     "fit_inversion": "diagnosis",
     "fit_residual": "update.residual",
@@ -117,10 +119,12 @@ _HOME = {
     "infer_discrepancy": "update.residual",
     "load": "data.io",
     "load_diagnoser": "diagnosis",
+    "load_twin": "update.loading",
     "measure_fidelity": "evaluation.fidelity",
     "next_experiments": "evaluation.experiments.propose",
     "run_study": "study",
     "save": "data.io",
+    "score_model": "evaluation",
     "write_report": "report",
 }
 
@@ -177,6 +181,7 @@ if TYPE_CHECKING:
         load_diagnoser,
     )
     from retwin.errors import InputError
+    from retwin.evaluation import Choice, fit, score_model
     from retwin.evaluation.diagnosers import evaluate
     from retwin.evaluation.experiments.propose import next_experiments
     from retwin.evaluation.fidelity import measure_fidelity
@@ -206,6 +211,7 @@ if TYPE_CHECKING:
     from retwin.update.identification import (
         identify,
     )
+    from retwin.update.loading import load_twin
     from retwin.update.residual import (
         Flow,
         Mixture,

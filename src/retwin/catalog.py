@@ -28,6 +28,7 @@ from retwin.entries import (
 
 __all__ = [
     "CALIBRATE_ON",
+    "CANDIDATES",
     "CASES",
     "CLASSIFIERS",
     "CORRECTIONS",
@@ -41,8 +42,10 @@ __all__ = [
     "METRICS",
     "NEEDS",
     "NETWORKS",
+    "OPENED_CASE",
     "PRESETS",
     "SOURCES",
+    "SURROGATE_MODES",
     "TWINS",
     "CaseEntry",
     "Entry",
@@ -60,6 +63,8 @@ __all__ = [
     "resolve",
 ]
 
+OPENED_CASE = "retwin.cases:get"
+"""The function from the name of a case to the case, for models that name the case of their twin."""
 CASES: Mapping[str, CaseEntry] = {
     "armpi": CaseEntry(
         "retwin.cases.armpi_fpv.case:armpi",
@@ -156,8 +161,33 @@ DENSITIES: Mapping[str, Entry] = {
     "sequence_mixture": Entry(
         "retwin.update.residual:SequenceMixture", "autoregressive mixture per sample"
     ),
+    "stationary": Entry(
+        "retwin.update.residual:StationaryNoise", "errors of the twin as noise, nothing corrected"
+    ),
 }
 """Families of distributions of z, by the names that case files and `--density` take."""
+
+SURROGATE_MODES: Mapping[str, str] = {
+    "auto": "a surrogate for a slow twin",
+    "on": "a surrogate always",
+    "off": "the twin itself",
+}
+"""Whether corrections are fitted to a surrogate of a twin."""
+
+CANDIDATES: Mapping[str, str] = {
+    "none": "the twin as it is",
+    "parameters": "identified parameters",
+    "delay_offset": "a delay and an offset per segment",
+    "dynamics": "corrected state equations",
+    "segments": "a correction per segment of the case",
+    "output": "a residual of each output sample",
+    "dynamics_output": "corrected state equations, then a residual of each output sample",
+    "arx": "linear model without the twin",
+    "narx": "polynomial model without the twin",
+    "neural_ss": "neural state-space model without the twin",
+    "lstm": "recurrent network without the twin",
+}
+"""Models that `rt.fit` compares, the simplest first, and those without the twin."""
 
 NETWORKS: Mapping[str, Entry] = {
     "mlp": Entry("retwin.nets.networks:MLP", "multi-layer perceptron, without memory"),
@@ -375,6 +405,13 @@ SOURCES: Mapping[str, SourceEntry] = {
         "Neural state-space model",
         "healthy",
         (("update", "neural_ss"),),
+        twin="retwin.study.sources:black_box",
+        simulates=True,
+    ),
+    "lstm": SourceEntry(
+        "LSTM",
+        "healthy",
+        (("update", "lstm"),),
         twin="retwin.study.sources:black_box",
         simulates=True,
     ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -121,7 +122,7 @@ class IsolatedPool:
         """End all processes; tasks that have not begun are dropped."""
         self._closed.set()
         for process in list(self._all):
-            process.process.kill()
+            process.kill()
         self._threads.shutdown(cancel_futures=True)
         for process in list(self._all):
             process.end()
@@ -145,7 +146,7 @@ class IsolatedPool:
                 process = self._own.process = _Isolated(self._begin)
                 self._all.add(process)
                 if self._closed.is_set():  # after `close` has killed the others
-                    process.process.kill()
+                    process.kill()
             try:
                 return process.ask(task, timeout, size)
             except BaseException as error:
@@ -216,7 +217,14 @@ class _Isolated:
         with self.clock:
             if time.monotonic() > self.deadline:
                 self.late = True
-                self.process.kill()
+                self.kill()
+
+    def kill(self) -> None:
+        """Kill the process, and with its group the processes that it has started."""
+        if os.name == "posix" and self.process.pid is not None:
+            with suppress(OSError):  # it has not made its group yet, or all of it has ended
+                os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.kill()
 
     def _code(self) -> int | None:
         """The exit code of a process that has closed its connection; None if it goes on."""
@@ -231,7 +239,7 @@ class _Isolated:
     def end(self) -> None:
         """End the process, also in the middle of a task."""
         with self.starting:
-            self.process.kill()
+            self.kill()
             self.process.join()
         self.here.close()
 
@@ -266,7 +274,17 @@ def _serve(
     _connection = connection
     if os.name == "posix":  # where code that writes to all descriptors would disturb all processes
         os.close(resource_tracker.getfd() or -1)
-    begin_worker(start, arguments, orphaned)
+        os.setpgid(0, 0)
+
+    def end_group(*given: Any) -> None:
+        try:
+            if orphaned is not None:
+                orphaned(*given)
+        finally:
+            if os.name == "posix":
+                os.killpg(0, signal.SIGKILL)
+
+    begin_worker(start, arguments, end_group)
     with suppress(EOFError, OSError):
         connection.recv()
         connection.send((True, ()))

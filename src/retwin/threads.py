@@ -36,7 +36,7 @@ def available() -> int:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One thread of torch, as many as before afterwards: for steps that are too small to divide."""
+    """One thread of torch and of BLAS, as many as before afterwards: for steps too small to divide."""
     import torch
 
     with _lock:
@@ -45,7 +45,8 @@ def one_thread() -> Iterator[None]:
         _blocks.append(count)
         torch.set_num_threads(1)
     try:
-        yield
+        with _libraries().limit(limits=1, user_api="blas"):
+            yield
     finally:
         with _lock:
             _blocks.pop()

@@ -665,6 +665,13 @@ WRONG = [
     ),
     (
         BASE,
+        BASE + "[faults]\nHealthy = { kind = 'SensorFreeze', output = 0 }\n",
+        r"case\.toml: faults\.Healthy: expected no fault",
+    ),
+    ('name = "toy"', 'name = " "', r"case\.toml: name: expected a name for the case"),
+    ('name = "toy"', 'name = "toy"\nfolder = "\\u0000"', r"case\.toml: folder.*zero character"),
+    (
+        BASE,
         BASE + "[faults]\nf = 'toy_module:split'\n",
         r"case\.toml: faults\.f: expected a Fault",
     ),

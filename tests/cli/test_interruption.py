@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import shlex
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -93,6 +95,24 @@ def test_a_fit_leaves_nothing_half_written(start, own: Path) -> None:
     line = running.interrupt(lambda: "fit: surrogate, 1 of 2" in running.stderr)
     assert "to begin anew, nothing is left half-written: retwin fit long.toml" in line
     assert {file.name for file in own.iterdir()} - before <= {"__pycache__"}
+
+
+def test_an_interrupt_while_the_program_is_imported_is_one_line() -> None:
+    code = """
+import os, signal, sys
+
+class Interrupts:
+    def find_spec(self, name, path=None, target=None):
+        if name == "retwin.cli.bench":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupts())
+from retwin.__main__ import main
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr == "error: interrupted; nothing was done yet\n"
 
 
 class InterruptedWhenDeleted:

@@ -6,6 +6,7 @@ import json
 import re
 import textwrap
 import tomllib
+from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,9 +25,11 @@ from retwin.data.logs.mapped import mapped
 from retwin.data.logs.mapping import Cut, Mapping
 from retwin.data.logs.reading import read_log
 from retwin.data.logs.signals import Clock, Log, Signal, named_unit
+from retwin.data.logs.tables import row_times
 from retwin.data.logs.units import compatible, converted
 from retwin.data.resampling import resampled
 from retwin.errors import InputError
+from retwin.report.log_picture import _thinned
 from retwin.serialisation.sizes import Budget
 
 
@@ -297,6 +300,54 @@ def test_times_out_of_order() -> None:
     assert len(in_order(Signal("y", twice, twice), "a")[0].times) == 100
     with pytest.raises(InputError, match=r"a step back of 0\.5 s at 0\.99 s"):
         in_order(Signal("y", np.concatenate([at, at + 0.49]), np.zeros(200)), "a")
+
+
+@pytest.mark.parametrize("period", [1.0, 60.0, 600.0, 1200.0])
+def test_the_hour_that_winter_time_repeats_is_named(period: float) -> None:
+    at = np.arange(0, 3 * 3600, period)
+    with pytest.raises(InputError, match=r"one hour twice.*end of summer time; record UTC"):
+        in_order(Signal("y", np.where(at < 5400, at, at - 3600), at), "a")
+
+
+def test_rows_in_the_reverse_order_have_their_length(tmp_path: Path) -> None:
+    rows = [f"{t:.1f},1,{np.sin(t):.4f}" for t in np.arange(30, 0, -0.1)]
+    (tmp_path / "a.csv").write_text("\n".join(["time,u,y", *rows]))
+    log = read_log(tmp_path / "a.csv", budget=Budget("a"))
+    assert log.end == pytest.approx(29.9)
+    assert made_of(log).provenance[0].notes[0].startswith("100.0% of the log's 29.9 s")
+
+
+@pytest.mark.parametrize(
+    ("first", "form"),
+    [
+        ("31.12.2026 11:59:58", "%d.%m.%Y %H:%M:%S"),
+        ("12/31/2026 11:59:58 AM", "%m/%d/%Y %I:%M:%S %p"),
+        ("12/31/2026, 11:59 AM", "%m/%d/%Y, %I:%M %p"),
+        ("31/12/2026 11:59:58", "%d/%m/%Y %H:%M:%S"),
+        ("2026/12/31 11:59:58.5", "%Y/%m/%d %H:%M:%S.%f"),
+        ("03/04/2026 11:59:58", ""),
+    ],
+)
+def test_dates_as_they_are_written_elsewhere(first: str, form: str) -> None:
+    begin = datetime.strptime(first, form or "%d/%m/%Y %H:%M:%S").replace(tzinfo=UTC)
+    moments = [begin + timedelta(minutes=i) for i in range(5)]
+    cells = np.array([each.strftime(form or "%d/%m/%Y %H:%M:%S") for each in moments])
+    if form:
+        times = row_times(cells, "", Clock(), "a")
+        assert times.tolist() == [round(each.timestamp() * 1e9) for each in moments]
+    else:
+        with pytest.raises(InputError, match=r"the day or the month may come first.*give format"):
+            row_times(cells, "", Clock(), "a")
+
+
+def test_a_picture_of_a_long_log_with_a_gap() -> None:
+    """A part of the drawn line holds no value at all."""
+    at = np.arange(5000.0)
+    values = np.where((at > 1000) & (at < 3000), np.nan, np.sin(at))
+    times, drawn = _thinned(at, values)
+    assert np.isnan(drawn).any()
+    assert np.nanmax(drawn) == np.nanmax(values)
+    assert times[-1] > 4990
 
 
 def test_a_clock_that_is_coarser_than_the_samples_is_refused() -> None:

@@ -41,7 +41,9 @@ def tank(interpolation: str, name: str = "pump", feedthrough: float = 0.0) -> St
         parameters=(
             Parameter("drain", "1/s", 0.05, 10.0, 0.8),
             Parameter("leak", "1/s", 0, 3, 0.5),
+            Parameter("dead", "s", 0.0, 3.0, 0.7),
         ),
+        delays={name: "dead"},
         interpolation=interpolation,
     )
 

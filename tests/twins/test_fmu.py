@@ -17,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from fmus import c_fmu, changed, described, python_fmu
 
@@ -211,6 +212,7 @@ TROUBLES = {
     115: "it wrote to the connection of its process",
     116: "it closed the connection of its process",
     117: "it wrote to the connection of its process",
+    119: "x is 9.05e+307 from 0.06 s on",
 }
 
 
@@ -223,16 +225,39 @@ def test_a_run_that_fails_ends_alone(lag: Path, workers: int) -> None:
     commands[:, :, 0] = np.arange(len(commands))[:, None] / 4
     commands[1::2, 5:, 1] = np.array(kinds)[:, None]
     reported: list[float] = []
-    with pytest.raises(rt.SimulationError, match=r"12 of 24 .* trajectory 1: hung") as caught:
+    with pytest.raises(rt.SimulationError, match=r"13 of 26 .* trajectory 1: hung") as caught:
         twin.simulate(commands, seed=0, progress=reported.append)
     assert caught.value.failed == {2 * i + 1: TROUBLES[kind] for i, kind in enumerate(kinds)}
     finished = caught.value.finished
-    assert finished.ids.tolist() == [f"{i:05d}" for i in range(0, 24, 2)]
+    assert finished.ids.tolist() == [f"{i:05d}" for i in range(0, 26, 2)]
     for made, which in zip(finished.observed, finished.ids, strict=True):
         truth = lagged(np.full(20, int(which) / 4), 1 / RATE)
         np.testing.assert_allclose(made[:, 0], truth, atol=1e-12)
     assert reported == sorted(reported)
     assert reported[-1] == 1.0
+
+
+@pytest.mark.skipif(os.name != "posix", reason="forks")
+def test_an_fmu_that_forks_leaves_no_processes(
+    lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LAG_FORKS", str(tmp_path / "forks"))
+    twin = FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x"], timeout=20, workers=1)
+    commands = np.zeros((2, 4, 2))
+    commands[0, 1, 1] = 118
+    commands[1, 1, 1] = 2  # this one dies besides, so that only its group is left
+    with pytest.raises(rt.SimulationError, match="1 of 2"):
+        twin.simulate(commands, seed=0)
+    children = [int(each) for each in (tmp_path / "forks").read_text().split()]
+    assert len(children) >= 4
+
+    def ended(process: int) -> bool:
+        try:
+            return bool(psutil.Process(process).status() == psutil.STATUS_ZOMBIE)
+        except psutil.NoSuchProcess:
+            return True
+
+    until(lambda: all(map(ended, children)))
 
 
 def test_the_failure_of_a_healthy_run_is_named_as_such(lag: Path) -> None:

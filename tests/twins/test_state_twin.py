@@ -250,7 +250,10 @@ def test_a_twin_without_commands_decays(interpolation: str) -> None:
 
 def test_a_trajectory_does_not_depend_on_the_batch_and_repeats() -> None:
     commands = noise(5, 60)
-    whole = duffing().simulate(commands, seed=0).observed
+    whole = duffing().simulate(commands[:, ::-1][:, ::-1], seed=0).observed  # any strides
+    np.testing.assert_array_equal(
+        duffing().hidden(commands[::-1])[::-1], duffing().hidden(commands)
+    )
     alone = [duffing().simulate(each[None], seed=1).observed[0] for each in commands]
     np.testing.assert_array_equal(whole, alone)
 

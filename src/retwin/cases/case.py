@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.cases.recorded import RecordedCase
 from retwin.checks import one_of, require
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.nets.networks import MLP, Network
 from retwin.nets.training import Training
 from retwin.progress import Progress
@@ -148,6 +148,20 @@ class Case(OfTwin):
             expected=f"commands at the rate of the twin, {self.rate:g} Hz",
             got=f"{self.sampler.rate:g} Hz",
             remedy="give both the same rate",
+        )
+        require(
+            all(each.strip() for each in (self.name, *self.faults, *self.causes)),
+            "name",
+            expected="a name for the case, and for each of its faults and causes",
+            got="an empty one",
+            remedy="write one by which you will know it",
+        )
+        require(
+            self.faults.get(HEALTHY) is None,
+            f"faults.{HEALTHY}",
+            expected=f"no fault: {HEALTHY!r} is the class without one",
+            got=self.faults.get(HEALTHY),
+            remedy="give the fault another name",
         )
         for name in self.dynamics.states:
             one_of("dynamics.states", name, state_names(self.twin) or (name,))

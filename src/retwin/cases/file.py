@@ -19,7 +19,7 @@ from retwin import catalog
 from retwin.cases.based_on import merged, parameters_of, updated_built_in
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
-from retwin.cases.named_twin import imported, parametric_twin, read_twin
+from retwin.cases.named_twin import delayed_twin, imported, parametric_twin, read_twin
 from retwin.checks import one_of, require
 from retwin.data.io import load
 from retwin.data.segments import Segments
@@ -34,6 +34,7 @@ from retwin.serialisation.configs import (
     from_settings,
     key,
 )
+from retwin.serialisation.places import real_path
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.fmu import FMUTwin
@@ -80,6 +81,7 @@ class CaseFile:
     sensor_rate: float | None = None
     inputs: dict[str, Any] | tuple[str, ...] = ()
     outputs: dict[str, Any] | tuple[str, ...] = ()
+    delays: dict[str, dict[str, Any]] = field(default_factory=dict)
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     commands: dict[str, Any] | str = field(default_factory=dict)
     faults: dict[str, dict[str, Any] | str] = field(default_factory=dict)
@@ -114,11 +116,19 @@ def read_case(path: str | Path) -> Case:
     rate = rate if isinstance(rate, int | float) else None
     keys = from_settings(CaseFile, settings, kinds, place=place, rate=rate)
     folder = home / keys.folder
+    with at(key(place, "folder")):
+        real_path(folder)
     twin = read_twin(keys.twin, keys.inputs, keys.outputs, keys.rate, folder, place)
+    inside = key(place, "delays")
+    tables = {f"delay_{name}": {"unit": "s", **each} for name, each in keys.delays.items()}
+    delays = parameters_of(tables, inside)
+    if delays:
+        twin = delayed_twin(twin, dict(zip(keys.delays, delays, strict=True)), inside)
     parametric = None
     if keys.parameters:
         inside = key(place, "parameters")
         free = parameters_of(keys.parameters, inside)
+        free += [each for each in delays if each.name not in keys.parameters]
         twin = parametric = parametric_twin(twin, free, inside)
     elif isinstance(twin, StateTwin) and twin.free:
         twin = parametric = twin.parametric()

@@ -21,6 +21,7 @@ from retwin.twins.function import FunctionTwin
 from retwin.twins.limits import Limits
 from retwin.twins.mujoco import MuJoCoTwin, Servo
 from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import Twin
 
 FILES: dict[str, Any] = {".fmu": FMUTwin, ".xml": MuJoCoTwin, ".urdf": MuJoCoTwin}
@@ -237,6 +238,24 @@ def parametric_twin(twin: Twin, free: Sequence[Parameter], place: str) -> Parame
     if unknown:
         raise _takes_none(place, getattr(twin.function, "__qualname__", "the function"), unknown)
     return ParametricTwin.built(partial(_with_values, twin), free)
+
+
+def delayed_twin(twin: Twin, delays: Mapping[str, Parameter], place: str) -> StateTwin:
+    """The twin whose commands of these names have these dead times.
+
+    Raises InputError for a twin that is no `StateTwin`, and for commands that it does not have.
+    """
+    if not isinstance(twin, StateTwin):
+        raise InputError(
+            place,
+            expected="dead times of a twin that is a StateTwin",
+            got=f"those of a {type(twin).__name__}",
+            remedy="delay the commands inside the twin, with a parameter of its own",
+        )
+    with at(place):
+        names = {command: each.name for command, each in delays.items()}
+        parameters = (*twin.parameters, *delays.values())
+        return replace(twin, parameters=parameters, delays={**twin.delays, **names})
 
 
 def _with_values(twin: FunctionTwin, values: Mapping[str, float]) -> FunctionTwin:

@@ -26,6 +26,7 @@ from retwin.cli import (
     diagnose,
     doctor,
     export,
+    fit,
     identify,
     models,
     monitor,
@@ -80,8 +81,9 @@ app.command(
     epilog=example("retwin identify plant.fmu log.csv --free gain=0.1:10 --out identified")
 )(identify.identify)
 app.command(epilog=example("retwin fit armpi --twin-data sim.mat --real real.mat --out model"))(
-    models.fit
+    fit.fit
 )
+app.command(epilog=example("retwin evaluate model --real other.csv"))(models.evaluate)
 app.command(epilog=example("retwin generate model --per-class 400 --out made.npz"))(models.generate)
 app.command("next", epilog=example("retwin next armpi model --real real.mat --out next.npz"))(
     proposals.propose

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 from retwin import catalog
-from retwin.checks import existing, one_of, require
+from retwin.checks import existing, one_of, positive, require
 from retwin.cli.completion import complete_twins
 from retwin.cli.completion import one_of as completing
 from retwin.cli.options import (
@@ -78,6 +78,14 @@ Starts = Annotated[
 SensorRate = Annotated[
     float | None, _panel("Method", metavar="HZ", help="True rate of the sensor, if lower.")
 ]
+Horizon = Annotated[
+    str,
+    _panel(
+        "Method",
+        metavar="SECONDS",
+        help="Windows whose starts are estimated, or free for whole records; else chosen.",
+    ),
+]
 Processes = Annotated[int, _panel("Method", metavar="N", help="Worker processes.", min=1, max=256)]
 Column = Annotated[
     list[str] | None,
@@ -104,6 +112,7 @@ def identify(
     loss: Loss = None,
     starts: Starts = None,
     sensor_rate: SensorRate = None,
+    horizon: Horizon = "",
     processes: Processes = 1,
     column: Column = None,
     time: Time = None,
@@ -128,7 +137,7 @@ def identify(
     from retwin.update.identification import identify as run
 
     check_place(out, folder=True, holds=HOLDS)
-    settings = _method(method, loss, starts)
+    settings, seconds = _method(method, loss, starts), _seconds(horizon)
     columns = replace(_columns(column, time, transient), mapping=mapping)
     names = [channel_names(each) for each in (inputs, outputs)]
     for log in logs:
@@ -155,6 +164,7 @@ def identify(
             seed=seed,
             rate=sensor_rate,
             processes=processes,
+            **({} if seconds is None else {"horizon": seconds}),
             progress=lambda share: show("search, 2 of 3", share),
         )
         show("validate, 3 of 3", 0.0)
@@ -228,6 +238,17 @@ def _method(name: str, loss: str | None, starts: int | None) -> Any:
     return catalog.resolve(catalog.IDENTIFICATIONS[name].target)(**options)
 
 
+def _seconds(horizon: str) -> float | None:
+    """A horizon in s; None for one that is chosen."""
+    if not horizon or horizon == "free":
+        return float("inf") if horizon else None
+    try:
+        seconds = float(horizon.removesuffix("s"))
+    except ValueError:
+        seconds = float("nan")
+    return positive("--horizon", seconds, remedy="write free, or a time such as 5s")
+
+
 def _columns(column: list[str] | None, time: str | None, transient: float) -> Columns:
     """Which columns of a log are the channels of the twin."""
     from retwin.cases import Columns
@@ -264,7 +285,7 @@ def _print(found: Identification, values: dict[str, Any], *, as_json: bool) -> N
     from retwin.report.identification.texts import findings, interval, state, value
 
     parameters = [
-        (p.name, p.unit, f"{p.start:.4g}", value(p), interval(p), state(p))
+        (p.name, "" if p.unit == "1" else p.unit, f"{p.start:.4g}", value(p), interval(p), state(p))
         for p in found.parameters
     ]
     held = found.compared == "validation"
@@ -273,9 +294,11 @@ def _print(found: Identification, values: dict[str, Any], *, as_json: bool) -> N
         pair = [each.identification, each.validation] if held else [each.identification]
         if any(error is not None and error.samples for error in pair):
             shown = [f"{x:.3g}" for e in pair if e is not None for x in (e.before, e.after)]
-            errors.append((each.name, each.unit, *shown))
+            unit = "" if each.unit == "1" else each.unit
+            errors.append((each.name, unit, *shown, f"{each.mean:.3g}"))
     heads = ["RMS error", "unit", "used: before", "after"]
     heads += ["held out: before", "after "] if held else []
+    heads += ["mean alone"]
     answer(
         values,
         table(("parameter", "unit", "before", "after", "95 % interval", ""), parameters),

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from retwin.catalog import CASES
-from retwin.checks import whole
+from retwin.checks import positive, whole
 from retwin.cli.completion import one_of
 
 CASE = "Built-in case, case.toml, or module:object."
@@ -71,6 +71,28 @@ Seed = Annotated[
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead, and nothing else.")]
+
+Horizon = Annotated[
+    str,
+    typer.Option(
+        "--horizon", metavar="TIME", help="Judge by predictions so far ahead, as 1s; or free."
+    ),
+]
+
+
+def seconds_of(option: str, text: str) -> float | None:
+    """The time in s of a text such as `0.5` or `1s`; None for `free`.
+
+    Raises InputError for another text.
+    """
+    if text == "free":
+        return None
+    number = text.removesuffix("s").strip()
+    try:
+        value = float(number)
+    except ValueError:
+        value = 0.0
+    return positive(option, value, remedy="write free, or a time in seconds such as 1s")
 
 
 def channel_names(text: str) -> tuple[str, ...]:

@@ -9,7 +9,6 @@ from retwin.checks import existing, given
 from retwin.cli.terminal import bar
 from retwin.data.io import DataCase, load
 from retwin.data.trajectories import Trajectories
-from retwin.serialisation.models import kind_of
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
@@ -50,10 +49,9 @@ def updated_twin(folder: Path) -> CorrectedTwin | DynamicsTwin:
 
     Raises InputError for any other kind.
     """
-    from retwin.update import CorrectedTwin, DynamicsTwin
+    from retwin.update import load_twin
 
-    kind = DynamicsTwin if kind_of(saved(folder)) == "dynamics" else CorrectedTwin
-    return kind.load(folder)
+    return load_twin(saved(folder))
 
 
 def read(

@@ -129,6 +129,11 @@ def identification_values(found: Identification, opened: OpenedTwin, logs: Logs)
         about["misspecified"] = result.misspecified
     else:
         about["loss"] = result.loss
+        about["horizon"] = result.horizon
+        about["horizons"] = [
+            {**asdict(each), "length": each.length and each.length / about["rate"]}
+            for each in result.horizons
+        ]
         about["starts"] = [asdict(each) for each in result.starts]
     return to_jsonable_python(about, inf_nan_mode="null", fallback=np.generic.item)
 

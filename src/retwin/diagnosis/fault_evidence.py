@@ -178,7 +178,9 @@ class FaultEvidence:
         match fault:
             case ParameterFault(parameter=name):
                 change = fault.profiles(active, size, onset, self.twin.rate)
-                return Variants(change=change, parameter=self.twin.shiftable.index(name)), none
+                return Variants(
+                    change=change, parameter=self.twin.equations.names.index(name)
+                ), none
             case ActuatorGain(actuator=place):
                 commands = np.tile(record.commands, (len(points), 1, 1))
                 commands[..., place] *= 1 + fault.profiles(active, size, onset, self.twin.rate)

@@ -190,11 +190,11 @@ def random_phase(phases: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def class_names(values: Sequence[object]) -> tuple[str, ...]:
-    """Class names as a model folder holds them; InputError unless they are texts."""
+    """Class names as a model folder holds them; InputError unless they are texts that differ."""
     require(
-        all(isinstance(value, str) for value in values),
+        all(isinstance(value, str) for value in values) and len(set(values)) == len(values),
         "classes",
-        expected="names of classes",
+        expected="names of classes, each once",
         got=repr(values),
         remedy="save the model again",
     )

@@ -10,6 +10,7 @@ from retwin._lazy import homes, names
 
 _HOME = homes(
     {
+        "choice": "CandidateScore Choice Fitted ModelScore fit predict_records score_model",
         "diagnosers": "evaluate",
         "experiments.propose": "Proposal next_experiments",
         "fidelity": "Fidelity Figure Overlay Simulation measure_fidelity measure_widening "

@@ -112,10 +112,11 @@ def _thinned(times: NDArray, values: NDArray) -> tuple[NDArray, NDArray]:
     kept: list[int] = []
     for part in parts:
         own = values[part]
-        holes = part[~np.isfinite(own)][:1].tolist()  # a hole stays one
-        if len(holes) < len(own):
-            holes += [int(part[np.nanargmin(own)]), int(part[np.nanargmax(own)])]
-        kept += sorted(set(holes))
+        missing = ~np.isfinite(own)
+        ends = part[missing][:1].tolist()  # a hole stays one
+        if not missing.all():
+            ends += [int(part[np.nanargmin(own)]), int(part[np.nanargmax(own)])]
+        kept += sorted(set(ends))
     return times[kept], values[kept]
 
 

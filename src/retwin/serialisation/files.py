@@ -20,7 +20,14 @@ from typing import Any
 
 from retwin.checks import existing
 from retwin.errors import InputError, brief
-from retwin.serialisation.places import refuse_others, unwritable
+from retwin.serialisation.places import (
+    OCCUPIED,
+    real_path,
+    refuse_others,
+    refuse_use,
+    room_for,
+    unwritable,
+)
 from retwin.serialisation.sizes import Budget
 
 AT_FDCWD, EXCHANGE = -100, 2
@@ -43,7 +50,9 @@ _count = itertools.count()
 
 
 @contextmanager
-def write_atomically(path: str | os.PathLike[str], *, folder: bool = False) -> Iterator[Path]:
+def write_atomically(
+    path: str | os.PathLike[str], *, folder: bool = False, replace: bool = True
+) -> Iterator[Path]:
     """A name in the same folder to write to; moved to `path` on success, removed on failure.
 
     For a file and for a folder alike: write a file to that name, or make a folder of that name and
@@ -51,39 +60,40 @@ def write_atomically(path: str | os.PathLike[str], *, folder: bool = False) -> I
     above `path` are made. If the block fails, with an exception or Ctrl-C, `path` stays as it was;
     a kill leaves the old contents or the new ones, and hidden files that the next process to write
     there removes. The name keeps the suffix of `path`, since many writers choose their format by
-    it.
+    it. Without `replace`, what another process has made there meanwhile stays.
 
     Raises
     ------
     InputError
-        `path` cannot be written, is a file instead of a folder or the reverse, or is a folder with
-        files that the new one does not replace.
+        `path` cannot be written, or not that much; is a file instead of a folder or the reverse; is
+        a folder with files that the new one does not replace; or has been made meanwhile.
     FileNotFoundError
         The block wrote nothing.
 
     """
     # Through a link the file behind it is replaced, not the link.
-    target = Path(os.path.realpath(path))
+    target = real_path(path)
     mark = f"{os.getpid()}-{TOKEN}-{next(_count)}"
     part = target.with_name(f"{_beginning(target)}{mark}{target.suffix}")
     _make_parent(target, part)
     recover(target)
     _sweep(target.parent)
     try:
-        if folder:
-            _check_kind(target, folder=True)
-            part.mkdir()
-        yield part
-        if not part.exists():
-            raise FileNotFoundError(f"nothing was written for {target.name}")
-        _move(part, target)
+        with room_for(target):
+            if folder:
+                _check_kind(target, folder=True)
+                part.mkdir()
+            yield part
+            if not part.exists():
+                raise FileNotFoundError(f"nothing was written for {target.name}")
+            _move(part, target, replace=replace)
     finally:
         _remove(part)
 
 
 def recover(path: str | os.PathLike[str]) -> Path:
     """`path`; a folder there whose replacement was killed halfway is put back first."""
-    target = Path(os.path.realpath(path))
+    target = real_path(path)
     # Not `target.exists()`, which raises for a name that is too long.
     if not os.path.exists(target) and target.parent.is_dir():
         for former in _formers(target):
@@ -206,8 +216,16 @@ def _check_kind(target: Path, *, folder: bool) -> None:
         )
 
 
-def _move(part: Path, target: Path) -> None:
+def _move(part: Path, target: Path, *, replace: bool) -> None:
     _check_kind(target, folder=part.is_dir())
+    if not replace:
+        try:
+            os.rename(part, target)
+        except OSError as error:
+            if error.errno not in OCCUPIED:
+                raise
+            raise refuse_use(target) from None
+        return
     if not (target.is_dir() and part.is_dir()):
         os.replace(part, target)
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from collections.abc import Collection, Iterator
@@ -13,6 +14,23 @@ from retwin.errors import InputError
 
 TOKEN = "-" * 16
 """As many characters as a name gets in addition while it is written, and one or two more."""
+
+NO_SPACE = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+"""Errors of a disk, a file or a quota that is full."""
+OCCUPIED = {errno.ENOTEMPTY, errno.EEXIST}
+"""Errors of a name to which a folder cannot be moved, since another one is there."""
+
+
+def real_path(path: str | os.PathLike[str]) -> Path:
+    """The path without links; InputError for a name with a zero character, which no system has."""
+    require(
+        "\0" not in os.fspath(path),
+        "path",
+        expected="a name without a zero character",
+        got=repr(os.fspath(path)),
+        remedy="give another name",
+    )
+    return Path(os.path.realpath(path))
 
 
 def check_place(
@@ -37,7 +55,7 @@ def check_place(
 
     """
     kind = "folder" if folder else "file"
-    target = Path(os.path.realpath(path))
+    target = real_path(path)
     try:
         present = {each.name for each in target.iterdir()} if target.is_dir() else set()
         right = target.is_dir() if folder else target.is_file()
@@ -62,6 +80,17 @@ def unwritable(target: Path, error: OSError) -> InputError:
         got=f"{_shortened(target)} ({error.strerror or type(error).__name__})",
         remedy="give another folder or name",
     )
+
+
+@contextmanager
+def room_for(target: Path) -> Iterator[None]:
+    """Name the place where an error in the block is that of a full disk, file or quota."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in NO_SPACE:
+            raise
+        raise unwritable(target, error) from None
 
 
 def refuse_others(target: Path, others: Collection[str]) -> None:
@@ -105,6 +134,16 @@ def in_use(folder: str | os.PathLike[str]) -> Iterator[None]:
         os.close(opened)
 
 
+def refuse_use(folder: str | os.PathLike[str]) -> InputError:
+    """The error about a folder that another process uses."""
+    return InputError(
+        "path",
+        expected="a folder that no other process writes to",
+        got=f"{folder}, which one writes to now",
+        remedy="wait until it has ended, or give another folder",
+    )
+
+
 def _lock(opened: int, folder: str | os.PathLike[str]) -> None:
     """Lock the folder until its descriptor is closed."""
     import fcntl
@@ -112,12 +151,7 @@ def _lock(opened: int, folder: str | os.PathLike[str]) -> None:
     try:
         fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise InputError(
-            "path",
-            expected="a folder that no other process writes to",
-            got=f"{folder}, which one writes to now",
-            remedy="wait until it has ended, or give another folder",
-        ) from None
+        raise refuse_use(folder) from None
     except OSError:
         return  # the file system has no locks
 

@@ -20,7 +20,7 @@ from retwin.study.plan import StudyPlan
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Twin
 from retwin.update.blackbox import BLACK_BOXES
-from retwin.update.corrected import generate
+from retwin.update.corrected import CorrectedTwin, generate
 from retwin.update.corrections import Correction
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.identification import PosteriorTwin
@@ -93,9 +93,11 @@ class Trial:
     def updated(self, method: str) -> Twin:
         """The twin that was updated: its parameters, their posterior, or its state equations.
 
-        A black-box model, which takes its place, is one of state equations.
+        A black-box model takes its place: an LSTM, or one of state equations.
         """
         folder = self._made("update", method)
+        if method == "lstm":
+            return CorrectedTwin.load(folder)
         if method == "dynamics" or method in BLACK_BOXES:
             return DynamicsTwin.load(folder)
         if method == "pi_bayes":

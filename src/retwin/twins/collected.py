@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.arrays import is_finite
+from retwin.data.measured import MAX_VALUE
 from retwin.data.trajectories import Channels, Provenance, Trajectories
 
 
@@ -123,16 +123,17 @@ class Collected:
         return made
 
     def _not_finite(self, index: slice) -> dict[int, str]:
-        """Trajectories of a chunk with outputs that are not finite, and where each begins so."""
+        """Trajectories of a chunk with outputs that no system has, and from when on."""
         reasons = {}
         for outputs in (self.observed[index], self.nominal[index]):
-            if is_finite(outputs):
+            # NaN makes these false, and what is larger has squares that are infinite in float32.
+            if outputs.min(initial=0.0) > -MAX_VALUE and outputs.max(initial=0.0) < MAX_VALUE:
                 continue
-            bad = ~np.isfinite(outputs)
+            bad = ~(np.abs(outputs) < MAX_VALUE)
             for i in np.flatnonzero(bad.any(axis=(1, 2))):
                 sample, channel = np.argwhere(bad[i])[0]
                 reasons[int(i)] = (
-                    f"{self.outputs.names[channel]} is {outputs[i, sample, channel]} from "
+                    f"{self.outputs.names[channel]} is {outputs[i, sample, channel]:.3g} from "
                     f"{sample / self.rate:g} s on"
                 )
         return reasons

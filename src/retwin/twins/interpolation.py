@@ -1,9 +1,13 @@
-"""How commands pass from one sample to the next: held, along straight lines, or along a spline."""
+"""How commands pass from one sample to the next, and how dead times delay them."""
 
 from __future__ import annotations
 
-from math import sqrt
+from collections.abc import Sequence
+from math import ceil, sqrt
 from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to import
     from torch import Tensor
@@ -15,6 +19,8 @@ cubic spline, for a signal that was band-limited before it was sampled."""
 TAPS = 24
 """Number of samples on either side on which a spline's slope depends: the weight of the next is
 5e-15 of the nearest one's."""
+MAX_TRIED = 100
+"""Dead times at most that are tried before a search: a linear step at each takes ms."""
 
 
 def cubic_coefficients(commands: Tensor, interpolation: str) -> Tensor:
@@ -46,6 +52,51 @@ def cubic_coefficients(commands: Tensor, interpolation: str) -> Tensor:
         parts = [held, first, 3 * rise - 2 * first - last, first + last - 2 * rise]
     end = [commands[:, -1:], *[torch.zeros_like(commands[:, -1:])] * 3]
     return torch.cat([torch.stack(parts, 2), torch.stack(end, 2)], dim=1)
+
+
+def delayed(commands: Tensor, places: Sequence[int], delays: Tensor, period: float) -> Tensor:
+    """Commands after dead times, as straight lines in these.
+
+    After m + f samples, 0 <= f < 1, a command u is (1 - f) u[k - m] + f u[k - m - 1]: of a held one
+    the mean over each sample of what then acts, of another one a straight line between whole
+    delays. So it is continuous in the delay, and linear between whole numbers of samples, which
+    gives its derivative. Before the first sample the command is the first one.
+
+    Parameters
+    ----------
+    commands : Tensor, shape (n, T, d_u)
+        Commands in double precision.
+    places : sequence of int
+        Indices of the D commands that are delayed, each once.
+    delays : Tensor, shape (n, D)
+        Their delays in s.
+    period : float
+        Sample period in s.
+
+    Returns
+    -------
+    Tensor, shape (n, T, d_u + D)
+        With a in place of a delayed command, and its b behind all commands: a + b delay acts.
+
+    """
+    import torch
+
+    steps = commands.shape[1]
+    whole = (delays.detach() / period).floor().clamp(0, steps)
+    index = torch.arange(steps)[:, None] - whole[:, None].long()
+    own = commands[..., list(places)]
+    now, before = (own.gather(1, (index - back).clamp_min(0)) for back in (0, 1))
+    made = commands.clone()
+    made[..., list(places)] = now - whole[:, None] * (before - now)
+    return torch.cat([made, (before - now) / period], dim=2)
+
+
+def delays_tried(low: float, high: float, rate: float) -> NDArray:
+    """Dead times in s between bounds, a sample apart, or further where those would be too many.
+
+    Errors over a dead time have several minima, as far apart as the commands change.
+    """
+    return np.linspace(low, high, min(ceil((high - low) * rate) + 1, MAX_TRIED))
 
 
 def _slopes(commands: Tensor) -> Tensor:

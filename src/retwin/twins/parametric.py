@@ -342,12 +342,17 @@ class ParametricTwin(TwinWrapper):
         if differentiated is None:
             return None
         inner = self.inner(dict(zip(self.names, values, strict=True)))
-        every = differentiated(commands, inner)[1]
-        mixed = np.zeros((every.shape[-1], len(self.parameters)))
+        return differentiated(commands, inner)[1] @ self.mixing
+
+    @property
+    def mixing(self) -> NDArray:
+        """Derivatives (q, k) of the parameters `names` of a `StateTwin` by the free ones."""
+        names: tuple[str, ...] = self.twin.names  # type: ignore[attr-defined]
+        made = np.zeros((len(names), len(self.parameters)))
         for column, each in enumerate(self.parameters):
             for place, factor in each.places.items():
-                mixed[self.twin.names.index(place), column] = factor  # type: ignore[attr-defined]
-        return every @ mixed
+                made[names.index(place), column] = factor
+        return made
 
     def inner(self, now: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
         """Values of the wrapped twin's parameters, for those of the free ones."""

@@ -41,6 +41,7 @@ def equations_of(twin: Any) -> dict[str, Any]:
         "substeps": twin.substeps,
         "interpolation": twin.interpolation,
         "limits": None if twin.limits is None else _bounded(twin.limits),
+        "delays": twin.delays,
         "learned": twin.learned,
     }
 
@@ -104,6 +105,7 @@ def equations_from(kind: type[Kind], about: dict[str, Any]) -> Kind:
         substeps=about["substeps"],
         interpolation=about["interpolation"],
         limits=None if about["limits"] is None else _limits(**about["limits"]),
+        delays=about.get("delays", {}),
         learned=one_of("learned", about.get("learned", False), (True, False)),
     )
     # Traced again, the same operations would take a hundred times as long to load.

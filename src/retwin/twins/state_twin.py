@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import at_least, one_of, require, whole
+from retwin.checks import at_least, finite, one_of, require, whole
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.times import sample_rate
@@ -21,7 +20,7 @@ from retwin.twins.limits import Limits
 from retwin.twins.parameter_values import values_per_simulation
 from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.saved_equations import equations_from, equations_of
-from retwin.twins.state import State
+from retwin.twins.state import State, check_delays
 from retwin.twins.step_error import warn_of_coarse_steps
 from retwin.twins.system_faults import parameter_changes
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
@@ -75,6 +74,11 @@ class StateTwin:
         they are held, and `fit_dynamics` chooses by the calibration record.
     limits : Limits, optional
         Range of the commands.
+    delays : mapping of str to str, optional
+        Names of commands that act after a dead time, each with the name of the parameter, in s,
+        that is its dead time: a parameter as any other, but for faults. Before the first sample a
+        command is the first one; a fraction of a sample is interpolated linearly, so that of a
+        held command the mean over each sample acts.
     learned : bool, default False
         Whether the equations were learned from simulations, so that the coordinates of their
         states are arbitrary; `fit_dynamics` then leaves to the parameters all that they explain.
@@ -112,10 +116,12 @@ class StateTwin:
     substeps: int = 1
     interpolation: str | None = None
     limits: Limits | None = None
+    delays: Mapping[str, str] = field(default_factory=dict)
     learned: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "states", tuple(self.states))
+        object.__setattr__(self, "delays", dict(self.delays))
         object.__setattr__(self, "parameters", tuple(self.parameters))
         at_least("states", self.states, 1, "state", remedy="a system without memory is a function")
         require(
@@ -144,6 +150,7 @@ class StateTwin:
             got=f"substeps={self.substeps}, interpolation={self.interpolation!r}",
             remedy="leave both out: a step covers one sample period",
         )
+        check_delays(self.delays, self.inputs.names, self.parameters)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """The equations as operations on numbers, since functions of any kind have these."""
@@ -163,7 +170,18 @@ class StateTwin:
     @property
     def fingerprint(self) -> str:
         """The equations as C99, which identify the twin where the names of functions do not."""
-        return self.model.source
+        return self.stepped.source
+
+    @property
+    def delay_places(self) -> tuple[tuple[int, int], ...]:
+        """Indices of the commands with a dead time, and of the parameters that are these."""
+        places = self.inputs.names.index, self.names.index
+        return tuple((places[0](u), places[1](name)) for u, name in self.delays.items())
+
+    @cached_property
+    def stepped(self) -> Model:
+        """The traced equations after the dead times of the commands; see `Model.delayed`."""
+        return self.model.delayed(self.delay_places) if self.delays else self.model
 
     @cached_property
     def model(self) -> Model:
@@ -175,7 +193,7 @@ class StateTwin:
             They cannot be traced, or return too few results.
 
         """
-        from retwin.twins.compiled.model import trace_model
+        from retwin.twins.compiled.model import trace_model, with_parameters
 
         function = self.step or self.derivative
         states, parameters = ([each.name for each in own] for own in (self.states, self.parameters))
@@ -189,8 +207,9 @@ class StateTwin:
 
     @property
     def shiftable(self) -> tuple[str, ...]:
-        """Names of the parameters, which can change during a simulation."""
-        return tuple(each.name for each in self.parameters)
+        """Names of the parameters that can change during a simulation: not the dead times."""
+        fixed = set(self.delays.values())
+        return tuple(each.name for each in self.parameters if each.name not in fixed)
 
     @property
     def free(self) -> tuple[Parameter, ...]:
@@ -310,14 +329,21 @@ class StateTwin:
 
     def values(self, parameters: Mapping[str, ArrayLike] | None, count: int) -> NDArray:
         """The values (count, k) of all parameters `names`."""
-        starts = [*(each.start for each in self.parameters), *(each.start for each in self.states)]
+        starts = [
+            *(each.start for each in self.parameters),
+            *(each.initial for each in self.states),
+        ]
         own = values_per_simulation(parameters, count, allowed=self.names)
         columns = zip(self.names, starts, strict=True)
-        return np.stack([own.get(name, np.full(count, start)) for name, start in columns], 1)
+        made = np.stack([own.get(name, np.full(count, start)) for name, start in columns], 1)
+        for _, place in self.delay_places:
+            finite(self.names[place], float(made[:, place].min(initial=0.0)), least=0.0)
+        return made
 
     def changes(self, faults: Sequence[Fault | None], steps: int) -> NDArray:
         """What faults, one per simulation, add to the parameters at each sample: (n, T, q)."""
-        return parameter_changes(faults, self.shiftable, steps, self.rate)
+        names = self.names[: len(self.parameters)]
+        return parameter_changes(faults, names, steps, self.rate)
 
     def steps(self, substeps: int | None = None) -> Steps:
         """The simulation from sample to sample, with other sub-steps if these are given.
@@ -327,7 +353,8 @@ class StateTwin:
         from retwin.twins.compiled.steps import Steps
 
         interpolation = self.interpolation or INTERPOLATIONS[0]
-        return Steps(self.model, 1 / self.rate, substeps or self.substeps, interpolation)
+        count = substeps or self.substeps
+        return Steps(self.stepped, 1 / self.rate, count, interpolation, self.delay_places)
 
     def _outputs(
         self,
@@ -377,23 +404,3 @@ class StateTwin:
         if self.step is None:
             finer, _ = self.steps(2 * self.substeps).run(commands, values)
             warn_of_coarse_steps(outputs[0], finer[0], self.outputs, self.substeps)
-
-
-def with_parameters(function: Callable[..., Any] | None) -> Callable[..., Any]:
-    """A function of x, u and p, where the user's may leave out p."""
-    require(
-        callable(function),
-        "output",
-        expected="functions of x, u and p",
-        got=repr(function),
-        remedy="give functions that can be called",
-    )
-    assert function is not None
-    places = [
-        each
-        for each in inspect.signature(function).parameters.values()
-        if each.default is each.empty and each.kind is not each.VAR_KEYWORD
-    ]
-    if len(places) == 2 and all(each.kind is not each.VAR_POSITIONAL for each in places):
-        return lambda x, u, p: function(x, u)
-    return function

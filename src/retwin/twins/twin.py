@@ -106,7 +106,7 @@ def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
         Another shape, no numbers, NaN or an infinite value.
 
     """
-    array = np.asarray(commands)
+    array = np.ascontiguousarray(commands)  # torch takes no negative strides
     shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] >= 2
     require(
         shaped and array.shape[2] == len(inputs) and array.dtype.kind in "fiu",

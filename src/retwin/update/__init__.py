@@ -17,10 +17,13 @@ _HOME = homes(
         "device": "DeviceTwin Records",
         "dynamics": "Curve Dynamics DynamicsTwin FittedDynamics Library Prediction TanhNetwork "
         "fit_dynamics",
+        "forecast_errors": "ForecastErrors",
+        "forecasts": "free_moments",
         "identification": "Evolution LeastSquares MCMC NPE Noise Optimum Posterior PosteriorTwin "
         "Profile Updated calibration_ranks identify profile",
+        "loading": "load_twin",
         "residual": "Density Flow Mixture Refinement Residual ResidualModel SequenceMixture "
-        "SequenceResidual fit_residual infer_discrepancy load_residual",
+        "SequenceResidual StationaryNoise fit_residual infer_discrepancy load_residual",
         "state_surrogate": "FittedStateSurrogate StateSurrogate fit_state_surrogate",
         "surrogate": "Surrogate fit_surrogate",
         "training_range": "OutsideTrainingWarning",

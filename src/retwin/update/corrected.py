@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from retwin.checks import whole
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
-from retwin.serialisation.models import read_about, refusing, write_model
+from retwin.serialisation.models import kind_of, read_about, refusing, write_model
 from retwin.serialisation.sizes import Budget
 from retwin.twins.faults import Fault
 from retwin.twins.system import System
@@ -25,7 +26,8 @@ from retwin.twins.twin import (
     simulate_in_chunks,
 )
 from retwin.update.corrections import measuring
-from retwin.update.exact import exact_surrogate
+from retwin.update.exact import ExactSurrogate, exact_surrogate
+from retwin.update.forecast_errors import ForecastErrors
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 from retwin.update.training_range import training_checked
@@ -44,14 +46,15 @@ class CorrectedTwin:
     Parameters
     ----------
     surrogate : Surrogate
-        The IBG, which gives the nominal output ŷ; or a twin in its place (see `ExactSurrogate`),
-        with which it cannot be saved.
+        The IBG, which gives the nominal output ŷ; or a twin in its place (see `ExactSurrogate`).
     residual : Residual
         The RG, which gives the distribution of z and holds the correction g.
     case : str
         Name of the case that it was fitted for; the command line reads it.
     random : bool
         Whether z is drawn; otherwise it is the mean z̄ (Eq. 8), the same in every simulation.
+    forecast : ForecastErrors, optional
+        Errors of predictions from measurements, by how far ahead; None where none were calibrated.
 
     """
 
@@ -59,6 +62,7 @@ class CorrectedTwin:
     residual: Residual
     case: str = ""
     random: bool = True
+    forecast: ForecastErrors | None = None
 
     def __post_init__(self) -> None:
         # To simulate, z is applied once: no differences are taken.
@@ -134,10 +138,17 @@ class CorrectedTwin:
             )
 
     def save(self, folder: str | Path) -> None:
-        """Write one folder with `surrogate` and `residual` inside; a failure leaves no folder."""
-        about = {"case": self.case, "random": self.random}
+        """Write one folder with `surrogate` and `residual` inside; a failure leaves no folder.
+
+        Raises InputError for a twin in place of a surrogate that cannot be saved.
+        """
+        about: dict[str, Any] = {"case": self.case, "random": self.random}
+        about["forecast"] = self.forecast and self.forecast.values
         with write_model(folder, "corrected", about, {}) as inside:
-            self.surrogate.save(inside / "surrogate")
+            if isinstance(self.surrogate, ExactSurrogate):
+                self.surrogate.save(inside / "surrogate", self.case)
+            else:
+                self.surrogate.save(inside / "surrogate")
             self.residual.save(inside / "residual")
 
     @classmethod
@@ -148,10 +159,12 @@ class CorrectedTwin:
         """
         about = read_about(folder, "corrected")
         folder = Path(folder)
-        surrogate = Surrogate.load(folder / "surrogate")
+        network = kind_of(folder / "surrogate") in ("surrogate", "")
+        surrogate: Any = (Surrogate if network else ExactSurrogate).load(folder / "surrogate")
         residual = load_residual(folder / "residual", surrogate.rate)
         with refusing(folder, expected="a corrected twin"):
-            return cls(surrogate, residual, about["case"], about["random"])
+            forecast = ForecastErrors.of(about.get("forecast"))
+            return cls(surrogate, residual, about["case"], about["random"], forecast)
 
 
 def generate(

@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.checks import require
-from retwin.errors import InputError
+from retwin import catalog
+from retwin.checks import given, require
 from retwin.progress import Progress
+from retwin.serialisation.models import kind_of, read_about, refusing, write_model
+from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.saved_equations import equations_from, equations_of
+from retwin.twins.state import State
+from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import Twin
 from retwin.twins.wrapper import OfTwin
+from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.surrogate import Surrogate
+
+KIND = "twin"
+"""Kind of a twin that was saved in place of a surrogate."""
 
 
 class ExactSurrogate(OfTwin):
@@ -44,7 +56,10 @@ class ExactSurrogate(OfTwin):
 
     def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
         """The nominal outputs (n, T, d_y), float32, for commands (n, T, d_u)."""
-        made = self.twin.simulate(np.asarray(commands, np.float64), seed=0, progress=progress)
+        values = np.asarray(commands, np.float64)
+        if isinstance(self.twin, DynamicsTwin):  # whose simulations have noise besides
+            return self.twin.simulation.most_probable(values)[0].astype(np.float32)
+        made = self.twin.simulate(values, seed=0, progress=progress)
         return made.nominal.astype(np.float32)
 
     def __call__(self, commands: Tensor) -> Tensor:
@@ -68,14 +83,83 @@ class ExactSurrogate(OfTwin):
             )
         return torch.as_tensor(self.predict(commands.numpy()))
 
-    def save(self, folder: str | Path) -> None:
-        """Refuse: loading a twin would run code."""
-        raise InputError(
-            "surrogate",
-            expected="a fitted surrogate, to be saved",
-            got=type(self.twin).__name__,
-            remedy="fit one with fit_surrogate, or save the residual model alone",
-        )
+    def save(self, folder: str | Path, case: str = "") -> None:
+        """Write the twin: its equations, or the name of the case whose twin it is, and its values.
+
+        Raises
+        ------
+        InputError
+            A twin that is neither a `StateTwin` nor that of a case.
+
+        """
+        if isinstance(self.twin, DynamicsTwin):
+            self.twin.save(folder)
+            return
+        about: dict[str, Any] = {}
+        if state_names(self.twin):
+            about["equations"] = equations_of(with_present_values(self.twin))  # type: ignore[arg-type]
+        else:
+            require(
+                case,
+                "case",
+                expected="the name of a case, whose twin can be opened again",
+                got=f"none, for a {type(self.twin).__name__}",
+                remedy="give the name of a case.toml; StateTwin and surrogates need none",
+            )
+            about["case"] = case
+            if isinstance(self.twin, ParametricTwin):
+                about["values"] = dict(zip(self.twin.names, self.twin.values, strict=True))
+        with write_model(folder, KIND, about, {}):
+            pass
+
+    @classmethod
+    def load(cls, folder: str | Path) -> ExactSurrogate:
+        """Read what `save` wrote; the twin of a case is opened, which may run the user's code.
+
+        Raises InputError if the folder holds no twin, is damaged, or its case is not there.
+        """
+        if kind_of(folder) == DynamicsTwin.kind:
+            return cls(DynamicsTwin.load(folder), differences=False)
+        about = read_about(folder, KIND)
+        if "equations" in about:
+            with refusing(folder, expected="the equations of a twin"):
+                return cls(equations_from(StateTwin, about["equations"]), differences=False)
+        system = catalog.resolve(catalog.OPENED_CASE)(about["case"])
+        values = about.get("values")
+        if values is None:
+            return cls(system.twin, differences=False)
+        parametric = require_parameters(system.parametric, about["case"])
+        return cls(parametric.with_values(values), differences=False)
+
+
+def require_parameters(parametric: ParametricTwin | None, case: str) -> ParametricTwin:
+    """The twin of a case with its parameters.
+
+    Raises InputError where the case does not declare them any more.
+    """
+    expected = "a case that declares the parameters of its twin, as when the model was saved"
+    return given(case, parametric, expected, got="none", remedy="restore its table [parameters]")
+
+
+def with_present_values(twin: StateTwin | ParametricTwin) -> StateTwin:
+    """The equations of a twin, whose parameters and states start at its present values."""
+    base, _, values = state_twin_of(twin)
+    return replace(
+        base,
+        parameters=tuple(_started(each, values[each.name]) for each in base.parameters),
+        states=tuple(_begun(each, values[f"start_{each.name}"]) for each in base.states),
+    )
+
+
+def _started(parameter: Parameter, value: float) -> Parameter:
+    low, high = min(parameter.low, value), max(parameter.high, value)
+    return replace(parameter, start=value, low=low, high=high)
+
+
+def _begun(state: State, value: float) -> State:
+    if state.low is None or state.high is None:
+        return replace(state, start=value)
+    return replace(state, start=value, low=min(state.low, value), high=max(state.high, value))
 
 
 def exact_surrogate(given: Surrogate | Twin, *, differences: bool = True) -> Surrogate:

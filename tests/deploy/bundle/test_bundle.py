@@ -230,12 +230,23 @@ def test_a_bundle_generates_without_its_case_where_it_can(bundle: Bundle) -> Non
 
 
 def test_a_diagnoser_of_other_classes_is_refused(bundle: Bundle, case: rt.Case) -> None:
-    bundle.diagnoser.classes, kept = ("a", "b"), bundle.diagnoser.classes
-    try:
-        with pytest.raises(rt.InputError, match="one of the classes of armpi"):
-            Bundle.of(case, bundle.twin, bundle.guard, bundle.diagnoser)
-    finally:
-        bundle.diagnoser.classes = kept
+    kept = bundle.diagnoser.classes
+    for other in (("a", "b"), kept[:1] * len(kept)):
+        bundle.diagnoser.classes = other
+        try:
+            with pytest.raises(rt.InputError, match="one of the classes of armpi"):
+                Bundle.of(case, bundle.twin, bundle.guard, bundle.diagnoser)
+        finally:
+            bundle.diagnoser.classes = kept
+
+
+def test_a_diagnoser_that_returns_texts_is_refused(
+    bundle: Bundle, emulated: rt.Trajectories, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts = np.full((3, len(bundle.diagnoser.classes)), "Healthy")
+    monkeypatch.setattr(bundle.diagnoser, "predict_proba", lambda some: texts[: len(some)])
+    with pytest.raises(rt.InputError, match="expected probabilities of 9 classes, got <U7"):
+        bundle.predict(emulated[:3])
 
 
 def test_a_description_without_end_is_refused(copy) -> None:

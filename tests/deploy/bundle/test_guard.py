@@ -105,7 +105,10 @@ def test_what_is_no_distribution_gives_no_class(row: list[float]) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("energy", np.nan), ("mismatch", np.inf), ("low", (np.nan,)), ("ceiling", (np.inf,))],
+    [
+        *[("energy", np.nan), ("mismatch", np.inf), ("low", (np.nan,)), ("ceiling", (np.inf,))],
+        *[("mismatch", -1.0), ("spread", (-1.0,)), ("high", (-1.0,)), ("speed", (-5.0,))],
+    ],
 )
 def test_a_domain_that_is_not_finite_is_refused(name: str, value: object) -> None:
     with pytest.raises(rt.InputError, match="expected finite ranges and limits"):

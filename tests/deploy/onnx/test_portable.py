@@ -19,6 +19,7 @@ from scipy.stats import kstest
 import retwin as rt
 from retwin.deploy.bundle.bundle import Bundle
 from retwin.deploy.bundle.seal import seal
+from retwin.deploy.onnx import session
 from retwin.deploy.onnx.export import PARITY, export_onnx
 from retwin.deploy.onnx.graphs import FeaturesGraph, SensorGraph
 from retwin.deploy.onnx.portable import Portable, settled_at
@@ -38,7 +39,13 @@ portable, trajectories = Portable.load(sys.argv[1]), load(sys.argv[2])
 found = portable.predict(trajectories)
 made = portable.simulate(trajectories.commands, seed=0)
 np.savez(sys.argv[3], found=found.probabilities, scores=found.verdicts.scores, made=made.observed)
-assert not {"torch", "sklearn"} & set(sys.modules), "torch was loaded"
+from importlib.metadata import packages_distributions
+names = packages_distributions()
+loaded = {names[each][0] for each in {name.partition(".")[0] for name in sys.modules} & set(names)}
+own = {"numpy", "onnxruntime", "pydantic", "scipy", "threadpoolctl"}  # as docs/bundle.md says
+theirs = {"annotated-types", "pydantic_core", "typing-inspection", "typing_extensions"}
+others = {"charset-normalizer", "setuptools"}  # which load themselves, or scipy if they are there
+assert loaded <= own | theirs | others, loaded
 """
 
 
@@ -325,6 +332,33 @@ def test_a_forged_graph_is_refused(
         forged.predict(emulated[:3])
 
 
+def test_a_graph_without_end_or_with_text_is_refused(
+    exported: Exported, emulated: rt.Trajectories, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "TIMEOUT", 0.5)
+    helper, types = onnx.helper, onnx.TensorProto
+    kinds = {"count": (types.INT64, []), "go": (types.BOOL, []), "x": (types.FLOAT, None)}
+    given = [helper.make_tensor_value_info(name, *kind) for name, kind in kinds.items()]
+    same = [helper.make_node("Identity", [each], [f"{each}2"]) for each in ("go", "x")]
+    made = [helper.make_tensor_value_info(f"{name}2", *kinds[name]) for name in ("go", "x")]
+    body = helper.make_graph(same, "body", given, made)
+    for loops, why in ((True, "runs for more than"), (False, "output of type")):
+        folder = Path(shutil.copytree(exported[0], tmp_path / why[:4]))
+        model = onnx.load(folder / "diagnoser.onnx")
+        graph, name = model.graph, model.graph.output[0].name
+        graph.output[0].name = "other"
+        if loops:
+            graph.initializer.append(onnx.numpy_helper.from_array(np.array(True), "first"))
+            graph.node.append(helper.make_node("Loop", ["", "first", name], ["other"], body=body))
+        else:
+            graph.node.append(helper.make_node("Cast", [name], ["other"], to=types.STRING))
+            graph.output[0].type.tensor_type.elem_type = types.STRING
+        onnx.save(model, folder / "diagnoser.onnx")
+        seal(folder)
+        with pytest.raises(rt.InputError, match=rf"diagnoser\.onnx.*{why}"):
+            Portable.load(folder).predict(emulated[:3])
+
+
 def test_a_graph_that_expands_is_refused(
     exported: Exported, emulated: rt.Trajectories, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -397,6 +431,8 @@ def test_a_damaged_export_is_refused(exported: Exported, tmp_path: Path) -> None
         *[(("movements",), value) for value in (-1, 0.5, 10**21)],
         *[(("steps",), value) for value in (0, 0.5)],
         *[(("domain", name), []) for name in ("low", "speed", "floor", "spread")],
+        (("domain", "mismatch"), -1.0),
+        (("diagnoser", "classes"), ["Healthy"] * 9),
         (("rate",), 0.0),
         (("rate",), np.nan),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,13 @@ import pytest
 import retwin as rt
 from retwin.errors import InputError
 from retwin.testing import TWIN_CHECKS, TwinSubject
-from retwin.update import BlackBox, DynamicsTwin, OutsideTrainingWarning, fit_black_box
+from retwin.update import (
+    BlackBox,
+    CorrectedTwin,
+    DynamicsTwin,
+    OutsideTrainingWarning,
+    fit_black_box,
+)
 from retwin.update.blackbox.narx import forward
 
 RATE = 10.0
@@ -103,6 +110,22 @@ def test_a_network_learns_a_saturation() -> None:
     alone = fit_black_box(calibration, "arx")
     network = fit_black_box(calibration, "neural_ss")
     assert error(network, test) < 0.3 * error(alone, test)
+
+
+@pytest.mark.slow
+def test_an_lstm_learns_a_saturation(tmp_path: Path) -> None:
+    calibration, test = record(saturating), record(saturating, seed=1)
+    alone, lstm = (fit_black_box(calibration, kind) for kind in ("arx", "lstm"))
+    assert isinstance(lstm.twin, CorrectedTwin)
+    mean = replace(lstm.twin, random=False).simulate(test.commands, seed=0).observed
+    assert rms((mean - test.nominal)[:, SETTLED:]) < 0.8 * error(alone, test)
+    lstm.twin.save(tmp_path / "model")
+    again = CorrectedTwin.load(tmp_path / "model").simulate(test.commands, seed=0)
+    assert np.array_equal(again.observed, lstm.twin.simulate(test.commands, seed=0).observed)
+    with pytest.warns(OutsideTrainingWarning):
+        lstm.twin.simulate(3 * test.commands, seed=0)
+    with pytest.raises(InputError, match="outputs that do not: y"):
+        fit_black_box(calibration.replace(observed=np.ones_like(test.observed)), "lstm")
 
 
 @pytest.mark.slow

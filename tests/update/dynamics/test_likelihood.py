@@ -32,7 +32,12 @@ def motor(interpolation: str) -> StateTwin:
             10 * x.current - p.friction * torch.tanh(x.speed),
             5 * u.voltage - 8 * x.current - 2 * x.speed,
         ),
-        parameters=(Parameter("friction", "1/s", 0.0, 5.0, 1.0), Parameter("gain", "1", 0, 2, 1.0)),
+        parameters=(
+            Parameter("friction", "1/s", 0.0, 5.0, 1.0),
+            Parameter("gain", "1", 0, 2, 1.0),
+            Parameter("dead", "s", 0.0, 1.0, 0.17),
+        ),
+        delays={"voltage": "dead"},
         substeps=2,
         interpolation=interpolation,
     )
@@ -43,7 +48,7 @@ def record(interpolation: str = "hold", proportional: float = 0.0) -> Record:
     twin = DynamicsTwin(
         equations,
         values=equations.values(None, 1)[0],
-        factor=np.diag([0.1, 0.05, 0.0, 0.1])[:, [0, 1, 3]],
+        factor=np.diag([0.1, 0.05, 0.01, 0.0, 0.1])[:, [0, 1, 2, 4]],
         start_deviation=np.zeros(2),
         process=np.array([1e-3, 1e-4]),
         proportional=np.full(2, proportional),

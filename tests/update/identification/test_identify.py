@@ -228,7 +228,9 @@ def test_bad_input_is_named() -> None:
     observed = measured(LAG, 0.05, seed=8, gain=GAIN, share=SHARE)
     faulty = observed.replace(labels=np.full(len(observed), "Stuck"))
     plain = LAG.twin.twin  # type: ignore[attr-defined]
+    still = observed.replace(commands=0 * observed.commands, observed=0 * observed.observed)
     for match, call in {
+        "never change and are equal": lambda: identify(LAG, still, seed=0),
         "twin: expected a ParametricTwin": lambda: identify(plain, observed, seed=0),
         "observed: expected healthy": lambda: identify(LAG, faulty, seed=0),
         "observed.rate": lambda: identify(LAG, observed.replace(rate=20.0), seed=0),

@@ -22,6 +22,8 @@ from retwin.errors import InputError
 DISORDER = 10.0
 """Longest step back in time, in median intervals, that is a matter of order: messages of several
 processes overtake each other. A longer one is a clock that was set."""
+HOUR = 3600.0
+"""By how much clocks are set back at the end of summer time, in s."""
 DECIMATED = 1.5
 """Ratio of the rates from which linear resampling leaves out values."""
 
@@ -279,6 +281,13 @@ def in_order(signal: Signal, where: str) -> tuple[Signal, list[str]]:
         "place for even rows",
     )
     worst = int(np.argmin(steps))
+    require(
+        abs(HOUR + steps[worst]) > 1.5 * typical or steps[worst] >= -typical,
+        place,
+        expected="times of a clock that nobody sets",
+        got=f"one hour twice, at {times[worst]:g} s, as at the end of summer time",
+        remedy="record UTC, or add its offset to each time (+02:00), or split the log there",
+    )
     require(
         -steps[worst] <= DISORDER * typical,
         place,

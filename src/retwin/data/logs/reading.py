@@ -128,7 +128,7 @@ def read_log(
         got=", ".join(f"{name} ({why})" for name, why in list(skipped.items())[:5]) or "none",
         remedy="check that it is the right file",
     )
-    begin = min((int(s.times[0]) for s in signals.values() if len(s.times)), default=0)
+    begin = min((int(s.times.min()) for s in signals.values() if len(s.times)), default=0)
     shifted = {
         name: replace(each, times=(each.times - begin) * NANOSECOND)
         for name, each in signals.items()

@@ -126,8 +126,8 @@ class Log:
 
     @property
     def end(self) -> float:
-        """The time of the last value, in s since the first one."""
-        return max((float(s.times[-1]) for s in self.signals.values() if len(s.times)), default=0.0)
+        """The latest time of a value, in s since the earliest one."""
+        return max((float(s.times.max(initial=0.0)) for s in self.signals.values()), default=0.0)
 
 
 def named_unit(name: str) -> tuple[str, str]:

@@ -30,6 +30,9 @@ MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", 
 """Cells that stand for a missing value, in small letters."""
 TRUTH = {"true": "1", "false": "0", "on": "1", "off": "0"}
 """Cells that stand for 1 and 0."""
+DATES = ("%d.%m.%Y", "%m/%d/%Y", "%d/%m/%Y", "%Y/%m/%d", "%Y-%m-%d")
+HOURS = ("%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%I:%M:%S %p", "%I:%M:%S.%f %p", "%I:%M %p")
+"""Formats of dates and of what follows them, of which one is taken that alone fits to all."""
 EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """The least times since 1970 in these units; smaller ones are in s."""
 
@@ -125,8 +128,19 @@ def _known(times: NDArray, missing: NDArray, where: str) -> NDArray:
 
 
 def _parsed(cells: NDArray, form: str, where: str) -> NDArray:
-    """Times in ns of ISO 8601 text, or of text in a format of `strptime`; UTC without a zone."""
+    """Times in ns of ISO 8601 text, or of text in a format of `strptime`; UTC without a zone.
+
+    Without a format, other dates are read too if one of `DATES` fits to all.
+    """
     made = np.empty(len(cells), np.int64)
+    if not form and len(cells) and not _fits(str(cells[0]).strip(), ""):
+        texts = [str(each).strip().replace(", ", " ") for each in cells]
+        forms = [f"{date} {hour}" for date in DATES for hour in HOURS]
+        fitting = [each for each in forms if all(_fits(text, each) for text in texts)]
+        if len(fitting) > 1:
+            raise _no_time(cells[:1], f"{where}, where the day or the month may come first")
+        if fitting:
+            cells, form = np.array(texts), fitting[0]
     for row, cell in enumerate(cells):
         text = str(cell).strip()
         try:
@@ -135,6 +149,15 @@ def _parsed(cells: NDArray, form: str, where: str) -> NDArray:
             raise _no_time(cells[row : row + 1], f"{where}, row {row}") from None
         made[row] = nanoseconds(time)
     return made
+
+
+def _fits(text: str, form: str) -> bool:
+    """Whether a text is a time in a format of `strptime`, or, for none, in that of ISO 8601."""
+    try:
+        datetime.strptime(text, form) if form else datetime.fromisoformat(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _no_time(cells: NDArray, where: str) -> InputError:

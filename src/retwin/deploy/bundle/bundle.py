@@ -13,7 +13,7 @@ import torch
 
 from retwin._version import __version__
 from retwin.cases.case import Case
-from retwin.checks import given, require
+from retwin.checks import given
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.deploy.bundle.facts import SAMPLERS, Facts
@@ -51,6 +51,9 @@ class Bundle:
     diagnoser: FittedDiagnoser | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.facts.check_classes(self.diagnoser)
+
     @classmethod
     def of(
         cls,
@@ -87,13 +90,6 @@ class Bundle:
             If the diagnoser's classes are not the case's.
 
         """
-        require(
-            diagnoser is None or set(diagnoser.classes) == set(case.classes),
-            "diagnoser",
-            expected=f"one of the classes of {case.name}, {', '.join(case.classes)}",
-            got=", ".join(() if diagnoser is None else diagnoser.classes),
-            remedy="train it on trajectories of this case",
-        )
         probe = case.sampler.sample(8, rng=np.random.default_rng(0))
         sets = [probe, *(each.commands for each in data if len(each))]
         facts = Facts(

@@ -120,7 +120,15 @@ class Prediction:
         rows = verdicts.verdict != "outside"
         found = np.full((len(trajectories), len(classes)), np.nan)
         if rows.any():
-            found[rows] = probabilities(_subset(trajectories, rows))
+            made = np.asarray(probabilities(_subset(trajectories, rows)))
+            require(
+                made.dtype.kind in "biuf" and made.shape == found[rows].shape,
+                "diagnoser",
+                expected=f"probabilities of {len(classes)} classes",
+                got=f"{made.dtype} of shape {made.shape}",
+                remedy="make the bundle anew, with another diagnoser",
+            )
+            found[rows] = made
         return cls(classes, found, verdicts)
 
     @property
@@ -152,7 +160,8 @@ class Domain:
     Raises
     ------
     InputError
-        If a number, or the width of a range, is not finite; or if one per channel is missing.
+        If a number, or the width of a range, is not finite, or a width or limit is negative; or if
+        one per channel is missing.
 
     """
 
@@ -180,10 +189,12 @@ class Domain:
                 np.subtract(self.ceiling, self.floor),
             ]
         numbers = [getattr(self, each.name) for each in fields(self)]
+        sizes = [*widths, self.speed, self.spread, self.mismatch]
         require(
-            all(np.isfinite(each).all() for each in [*numbers, *widths]),
+            all(np.isfinite(each).all() for each in [*numbers, *widths])
+            and all(np.greater_equal(each, 0).all() for each in sizes),
             "domain",
-            expected="finite ranges and limits",
+            expected="finite ranges and limits, none of them negative",
             got=self,
             remedy="make the bundle and its export anew",
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import tempfile
@@ -129,7 +130,8 @@ def export_fmu(
             version,
             identifier,
             token,
-            text.about or path.stem,
+            # A twin knows its case by the path of its file, which concerns nobody else.
+            Path(text.about).stem if os.path.isabs(text.about) else text.about or path.stem,
             text.variables,
             1 / text.rate,
         ),

@@ -5,6 +5,9 @@
  *   NV                    real variables, by value reference
  *   SUBSTEPS, PERIOD      steps of the integration per sample, sample period in s
  *   LINEAR                1 if commands are straight lines between samples, 0 if they are held
+ *   NI, ND                commands, and those of them with a dead time: DELAYED[ND] are their
+ *   DEAD[ND], LONGEST[ND] indices, these those of the parameters, and the longest in s; the NU
+ *   PAST                  commands of the model are those of `delayed` in Python; samples kept
  *   VALUES[NQ], PLACE[NQ] parameters and start values, and their value references, -1 for none
  *   FACTOR[NQ][NR]        of the covariance of these, FACTOR FACTOR^T
  *   START[NX]             deviations by which starts differ between instances
@@ -13,7 +16,7 @@
  *
  * and, where there was a calibration, RANGED and
  *
- *   LEAST[NX + NU], GREATEST[NX + NU] values beyond which states and commands are outside of it */
+ *   LEAST[NX + NI], GREATEST[NX + NI] values beyond which states and commands are outside of it */
 
 #define QUANTILE 1.6448536269514722
 
@@ -21,7 +24,7 @@
 typedef struct {
     double v[NV];                /* variables by value reference */
     double begin;                /* time of the first sample */
-    double before[NU + 1];       /* commands of the sample before, for straight lines */
+    double past[PAST][NI + 1];   /* commands of the samples before, the last one first */
     double z[NX * (1 + NQ)];     /* most probable states, and their derivatives by all values */
     double kicked[NX];           /* states with process noise */
     double P[NX * NX];           /* covariance of the states by process noise */
@@ -44,11 +47,39 @@ static void present(const Twin *twin, double *q)
         q[i] = PLACE[i] < 0 ? VALUES[i] : twin->v[PLACE[i]];
 }
 
-/* The commands as the actuators execute them, u[NU]. */
-static void executed(const Twin *twin, double *u)
+/* A command as the actuator executes it, so many samples back; before the first sample the first. */
+static double executed(const Twin *twin, int i, int back)
 {
-    for (int i = 0; i < NU; i++)
-        u[i] = twin->v[COMMAND + i] * (1.0 + twin->v[GAIN + i]);
+    if (back > 0 && twin->samples > 0)
+        return twin->past[back - 1][i];
+    return twin->v[COMMAND + i] * (1.0 + twin->v[GAIN + i]);
+}
+
+/* The model's commands u[NU] so many samples back. Dead times that are not kept give NaN. */
+static void commanded(const Twin *twin, const double *q, int back, double *u)
+{
+    for (int i = 0; i < NI; i++)
+        u[i] = executed(twin, i, back);
+    for (int k = 0; k < ND; k++) {
+        const double delay = q[DEAD[k]];
+        const int kept = delay >= 0.0 && delay <= LONGEST[k];
+        const int whole = kept ? (int)floor(delay / PERIOD) : 0;
+        const double now = executed(twin, DELAYED[k], back + whole);
+        const double rise = executed(twin, DELAYED[k], back + whole + 1) - now;
+        u[DELAYED[k]] = kept ? now - whole * rise : NAN;
+        u[NI + k] = rise / PERIOD;
+    }
+}
+
+/* Keep the present commands: as all the earlier ones too, at the first sample. */
+static void keep(Twin *twin)
+{
+    double now[NI + 1];
+    for (int i = 0; i < NI; i++)
+        now[i] = executed(twin, i, 0);
+    memmove(twin->past + 1, twin->past, (PAST - 1) * sizeof *twin->past);
+    for (int back = 0; back < (twin->samples > 0 ? 1 : PAST); back++)
+        memcpy(twin->past[back], now, NI * sizeof *now);
 }
 
 static void draw_error(Twin *twin)
@@ -64,7 +95,7 @@ static void reset(Twin *twin)
     for (int i = 0; i < NQ; i++)
         if (PLACE[i] >= 0)
             twin->v[PLACE[i]] = VALUES[i];
-    for (int i = 0; i < NU; i++)
+    for (int i = 0; i < NI; i++)
         twin->v[COMMAND + i] = FIRST[i];
 }
 
@@ -89,7 +120,6 @@ static void begin(Twin *twin)
     for (int i = 0; i < NX; i++)
         twin->moves[NP + i] += START[i] * normal(twin);
     draw_error(twin);
-    executed(twin, twin->before);
     twin->samples = 0;
     twin->begun = 1;
     twin->ready = 0;
@@ -100,12 +130,11 @@ static void next(Twin *twin)
 {
     double q[NQ], c[4 * NU + 1] = {0}, u[NU + 1], F[NX * (1 + NX)], FP[NX * NX];
     present(twin, q);
-    executed(twin, u);
-    for (int i = 0; i < NU; i++) {
-        c[i] = LINEAR ? twin->before[i] : u[i];
-        c[NU + i] = LINEAR ? u[i] - twin->before[i] : 0.0;
-        twin->before[i] = u[i];
-    }
+    commanded(twin, q, 0, u);
+    commanded(twin, q, LINEAR, c);
+    for (int i = 0; i < NU; i++)
+        c[NU + i] = u[i] - c[i];
+    keep(twin);
     for (int i = 0; i < NX; i++) {
         F[i] = twin->z[i];
         for (int j = 0; j < NX; j++)
@@ -136,7 +165,7 @@ static void next(Twin *twin)
 /* Whether the present states or commands leave the range of the calibration. */
 static int outside(const Twin *twin)
 {
-    for (int i = 0; i < NX + NU; i++) {
+    for (int i = 0; i < NX + NI; i++) {
         double value = i < NX ? twin->z[i] : twin->v[COMMAND + i - NX];
         if (value < LEAST[i] || value > GREATEST[i])
             return 1;
@@ -152,9 +181,7 @@ static void evaluate(Twin *twin)
     if (twin->ready)
         return;
     present(twin, q);
-    executed(twin, u);
-    if (LINEAR && twin->samples > 0)
-        memcpy(u, twin->before, NU * sizeof *u);
+    commanded(twin, q, LINEAR, u);
     output(twin->kicked, u, q, kicked);
     output_jacobian(twin->z, u, q, mean, hx, hp);
     for (int i = 0; i < NY; i++) {
@@ -200,7 +227,7 @@ static int advance_to(Twin *twin, double time)
         if (!LINEAR || twin->samples > 0)
             next(twin);
         else
-            executed(twin, twin->before);
+            keep(twin);
         twin->samples++;
         twin->ready = 0;
     }

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import ceil
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from retwin.checks import require
 from retwin.compiler import c_source
@@ -115,14 +116,19 @@ def _variables(twin: DynamicsTwin, ranged: bool) -> tuple[list[Variable], list[i
 def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
     """The equations of a twin and its numbers as C."""
     states, outputs = len(twin.process), len(twin.outputs)
+    delays = twin.equations.delay_places
+    longest = [twin.equations.parameters[place].high for _, place in delays]
     sizes = {
         "NR": twin.factor.shape[1],
         "NV": 1 + 2 * len(twin.inputs) + 5 * outputs + sum(each >= 0 for each in places),
         "SUBSTEPS": twin.equations.substeps,
         "LINEAR": int(twin.equations.interpolation == "linear"),
+        "NI": len(twin.inputs),
+        "ND": len(delays),
+        "PAST": 3 + ceil(max(longest, default=0.0) * twin.rate),
     }
     numbers = {"PERIOD": 1 / twin.rate}
-    arrays: Mapping[str, NDArray] = {
+    arrays: Mapping[str, ArrayLike] = {
         "VALUES": twin.values,
         "FACTOR": twin.factor.ravel(),
         "START": twin.start_deviation,
@@ -130,6 +136,7 @@ def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
         "NOISE": twin.noise,
         "WIDENING": twin.widening,
         "FIRST": twin.domain.mean[states:],
+        "LONGEST": longest,
     }
     if ranged:
         low, high = twin.bounds
@@ -138,5 +145,6 @@ def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
     lines += ["#define RANGED"] * ranged
     lines += [f"#define {name} {value!r}" for name, value in numbers.items()]
     lines += [constants(name, values) for name, values in arrays.items()]
-    lines.append(constants("PLACE", places, "int"))
-    return "\n".join([twin.equations.model.steps_source, *lines])
+    indices = {"PLACE": places, "DELAYED": [u for u, _ in delays], "DEAD": [p for _, p in delays]}
+    lines += [constants(name, values, "int") for name, values in indices.items()]
+    return "\n".join([twin.equations.stepped.steps_source, *lines])

@@ -66,7 +66,7 @@ def surrogate_text(twin: Surrogate | CorrectedTwin, commands: NDArray | None = N
         networks.append(encoder)
         parts += texts
     kinds = sorted({each.kind.upper() for each in networks})
-    sizes = {"NU": inputs, "NY": outputs, "NV": 1 + 2 * inputs + 5 * outputs}
+    sizes = {"NU": inputs, "NI": inputs, "NY": outputs, "NV": 1 + 2 * inputs + 5 * outputs}
     sizes |= {"WIDEST": max(each.widest for each in networks)}
     defined = "".join(f"#define {name} {size}\n" for name, size in sizes.items())
     defined += "".join(f"#define USES_{kind}\n" for kind in kinds)

@@ -128,6 +128,9 @@ class Portable:
     emulated: bool = False
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.facts.check_classes(self.diagnoser)
+
     @classmethod
     def load(cls, folder: str | Path, *, threads: int = 1) -> Portable:
         """Read what `export_onnx` wrote, after its seal was verified.

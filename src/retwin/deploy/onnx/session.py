@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 EXPECTED = "a graph that retwin bundle export wrote"
+TIMEOUT, TIMEOUT_PER_ROW = 60.0, 0.1
+"""Longest duration in s of a run, and what each trajectory adds: a graph may loop for ever."""
 REMEDY = "make it anew with retwin bundle export, or give it less at once if memory is short"
 
 
@@ -34,13 +37,26 @@ class Session:
     def __init__(self, session: InferenceSession, file: Path) -> None:
         self.session = session
         self.file = file
+        self.threads = ThreadPoolExecutor()
         self.inputs = {each.name: each.shape for each in session.get_inputs()}
 
     def __call__(self, **arrays: NDArray) -> NDArray:
-        """The output of the graph; InputError if it does not run."""
+        """The output of the graph; InputError if it does not run, or not within its time."""
+        from onnxruntime import RunOptions
+
         given = {name: array for name, array in arrays.items() if name in self.inputs}
+        limit = TIMEOUT + TIMEOUT_PER_ROW * max(map(len, given.values()), default=0)
+        options = RunOptions()
+        running = self.threads.submit(self.session.run, None, given, options)
         with refusing(self.file, expected=EXPECTED, remedy=REMEDY):
-            result: NDArray = self.session.run(None, given)[0]
+            try:
+                result: NDArray = np.asarray(running.result(timeout=limit)[0])
+            except TimeoutError:
+                raise self.refused(f"one that runs for more than {limit:g} s") from None
+            finally:
+                options.terminate = True  # it has ended, or is to
+        if result.dtype.kind not in "biuf":
+            raise self.refused(f"an output of type {result.dtype}")
         return result
 
     def checked(self, shape: tuple[int, ...], **arrays: NDArray) -> NDArray:

@@ -34,7 +34,7 @@ from retwin.jobs import alone, each
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically, write_json
 from retwin.serialisation.identity import identity
-from retwin.serialisation.places import in_use
+from retwin.serialisation.places import in_use, real_path, room_for
 from retwin.serialisation.sizes import Budget
 
 SCHEMA = 2
@@ -116,7 +116,7 @@ def simulate_to(
 
     """
     report = progress or (lambda share: None)
-    target = Path(os.path.realpath(path))
+    target = real_path(path)
     if check_target(target) == ".npz":
         _check_small(plan, workers, scheduler)
         return _into_npz(target, plan, report)
@@ -132,7 +132,7 @@ def simulate_to(
         return _finished(target, plan, about)
     earlier = _part(target).exists()
     job = _Job.begun(target, plan, about)
-    with in_use(job.part):
+    with room_for(job.part), in_use(job.part):
         try:
             job.finish(workers, scheduler, report)
         except InputError as error:
@@ -165,7 +165,7 @@ class _Job:
         if not part.exists():
             Budget("n", disk=target.parent).take(plan.count * plan.trajectory_bytes)
             Budget("chunk").take(COPIES * plan.chunk * plan.trajectory_bytes)
-            with write_atomically(part) as new:
+            with write_atomically(part, replace=False) as new:
                 (new / "done").mkdir(parents=True)
                 if isinstance(plan.commands, Recorded):
                     np.save(new / "commands.npy", plan.commands.array)

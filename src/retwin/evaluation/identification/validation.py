@@ -21,12 +21,13 @@ from retwin.scores.intervals import MIN_GROUPS, jackknife_interval
 from retwin.scores.residuals import decorrelated_after
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import checked_stride
+from retwin.update.identification.horizon import predictions
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.posterior import Posterior
+from retwin.update.identification.windows import simulated as simulated_outputs
 
 BEGIN = 10
 """The begin of a trajectory is its part by this number."""
-
 MAX_BLOCKS = 20
 """Blocks into which held-out records are divided for an interval, at most."""
 Part = Literal["identification", "validation"]
@@ -35,7 +36,7 @@ Split = Literal["trajectories", "time", "none"]
 
 @dataclass(frozen=True)
 class RMSError:
-    """Root mean square error of free simulation before and after, in the output's unit.
+    """Root mean square error of simulation before and after, in the output's unit.
 
     Attributes
     ----------
@@ -75,6 +76,8 @@ class OutputError:
         On the measurements that the parameters were identified on.
     validation : RMSError or None
         On those that were held out; None if none were.
+    mean : float
+        The RMS error of the mean of the measurements used, on those that were held out if any were.
 
     """
 
@@ -83,6 +86,7 @@ class OutputError:
     spread: float
     identification: RMSError
     validation: RMSError | None
+    mean: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,14 +106,14 @@ class Identification:
     basis : str
         What the errors rest on: "trajectories", "samples" or "posterior".
     outputs : tuple of OutputError
-        The errors of free simulation before and after.
+        The errors of simulation before and after: free, or over `horizon`.
     residuals : tuple of ResidualTest
         Tests of the residuals after identification, on the held-out measurements if there are any.
     split : str
         What was held out: "trajectories", the last part of each in "time", or "none".
     simulated : dict of str to tuple
         By part, "identification" and "validation": measured trajectories, and outputs (n, T, d_y)
-        of the twin before and after.
+        of the twin before and after. Over a horizon, the mask contains the samples predicted.
     found : Updated or Posterior
         The result of `rt.identify`.
 
@@ -149,16 +153,18 @@ class Identification:
         without errors in both parts are left out.
         """
         measured, _, after = self.simulated["identification"]
-        error, first = measured.observed - after, np.zeros(measured.mask.shape[:2], dtype=bool)
-        for row, length in enumerate(measured.lengths):
-            first[row, : max(1, length // BEGIN)] = True
-        made = {}
+        first = np.arange(measured.steps) < np.maximum(1, measured.lengths[:, None] // BEGIN)
+        error, made = measured.observed - after, {}
         for i, name in enumerate(measured.outputs.names):
-            seen = measured.mask[..., i]
-            begin, rest = (error[..., i][seen & part] for part in (first, ~first))
-            if len(begin) and len(rest) and np.any(rest):
-                made[name] = float(np.sqrt(np.mean(begin**2) / np.mean(rest**2)))
+            parts = [error[..., i][measured.mask[..., i] & part] for part in (first, ~first)]
+            if all(map(len, parts)) and np.any(parts[1]):
+                made[name] = float(np.sqrt(np.mean(parts[0] ** 2) / np.mean(parts[1] ** 2)))
         return made
+
+    @property
+    def horizon(self) -> float:
+        """Time in s over which outputs are predicted; infinite in free simulation."""
+        return self.found.horizon if isinstance(self.found, Updated) else float("inf")
 
     @property
     def at_bound(self) -> tuple[str, ...]:
@@ -217,17 +223,14 @@ def validate_identification(
         got=", ".join(before.names),
         remedy="give the twin that was identified, at its values before",
     )
+    horizon = found.horizon if isinstance(found, Updated) else float("inf")
     parts: dict[Part, Trajectories] = {"identification": used}
     if held_out is not None:
         parts["validation"] = held_out
     simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]] = {}
     for part, measured in parts.items():
         checked_stride(before, measured, None, part)
-        first, second = (
-            twin.simulate(measured.commands.astype(np.float64), seed=seed).observed
-            for twin in (before, mean)
-        )
-        simulated[part] = (measured, first, second)
+        simulated[part] = _simulated(before, mean, measured, used, horizon, seed)
     uncertainty = uncertainty_of(before, found)
     last = simulated["validation" if held_out is not None else "identification"]
     return Identification(
@@ -236,12 +239,41 @@ def validate_identification(
         correlation=uncertainty.correlation,
         directions=uncertainty.directions,
         basis=uncertainty.basis,
-        outputs=_outputs(simulated),
+        outputs=_outputs(simulated, used),
         residuals=residual_tests(_residual(last[0], last[2]), last[0]),
         split=_split(used, held_out),
         simulated=simulated,
         found=found,
     )
+
+
+def _simulated(
+    before: ParametricTwin,
+    after: ParametricTwin,
+    measured: Trajectories,
+    used: Trajectories,
+    horizon: float,
+    seed: int,
+) -> tuple[Trajectories, NDArray, NDArray]:
+    """Measurements, and outputs before and after: free, or predicted over a horizon in s.
+
+    Starts that are not given are those that fit the measurements used of the same trajectories,
+    or the first tenth of those that were held out as a whole.
+    """
+    if np.isfinite(horizon):
+        made = [
+            predictions(twin, measured, round(horizon * measured.rate)) for twin in (before, after)
+        ]
+        outputs = [measured.observed - error for error, _ in made]
+        return measured.replace(mask=made[0][1]), outputs[0], outputs[1]
+    known = used.mask
+    if _split(used, measured) == "trajectories":
+        begin = np.arange(measured.steps) < np.maximum(measured.lengths[:, None] // BEGIN, 2)
+        known = measured.mask & begin[..., None]
+    first, second = (
+        simulated_outputs(twin, measured, known, seed=seed) for twin in (before, after)
+    )
+    return measured, first, second
 
 
 def _split(used: Trajectories, held_out: Trajectories | None) -> Split:
@@ -260,7 +292,7 @@ def _residual(measured: Trajectories, outputs: NDArray) -> NDArray:
 
 
 def _outputs(
-    simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]],
+    simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]], used: Trajectories
 ) -> tuple[OutputError, ...]:
     """The errors of each output in each part."""
     first = simulated["identification"][0]
@@ -276,8 +308,14 @@ def _outputs(
             for part, (measured, before, after) in simulated.items()
         }
         spread = float(together.std()) if len(together) else float("nan")
+        known, last = used.observed[..., channel][used.mask[..., channel]], values[-1]
+        mean = float("nan")
+        if len(known) and len(last):
+            mean = float(np.sqrt(np.mean((last.astype(np.float64) - known.mean()) ** 2)))
         made.append(
-            OutputError(name, unit, spread, errors["identification"], errors.get("validation"))
+            OutputError(
+                name, unit, spread, errors["identification"], errors.get("validation"), mean
+            )
         )
     return tuple(made)
 

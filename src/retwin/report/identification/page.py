@@ -157,23 +157,31 @@ def _errors(found: Identification) -> Table:
     for each in found.outputs:
         if not (each.identification.samples or (each.validation and each.validation.samples)):
             continue
-        row = [Cell(each.name, _unit(each.unit)), Cell(significant(each.spread))]
+        row = [Cell(each.name, _unit(each.unit)), Cell(significant(each.mean))]
         for error in (each.identification, each.validation):
             if error is None:
                 continue
-            share = error.after / each.spread if each.spread > 0 else float("nan")
+            share = error.after / each.mean if each.mean > 0 else float("nan")
             row += [
                 Cell(significant(error.before)),
                 Cell(significant(error.after), best=True),
-                Cell(f"{100 * share:.1f} %" if isfinite(share) else "–"),
+                Cell(f"{100 * share:.1f} %" if isfinite(share) else "–", tone=_worse(share)),
                 Cell(change(error, interval=False), _range_of(error)),
             ]
         rows.append(row)
-    group = ("before", "after", "of the spread", "change")
-    heads = [Column("output", numeric=False), Column("spread")]
+    group = ("before", "after", "of the mean's", "change")
+    heads = [Column("output", numeric=False), Column("record's mean")]
     heads += [Column(text, "measurements used") for text in group]
     heads += [Column(text, "held out") for text in group] if held else []
-    return Table("RMS error of free simulation", heads, rows)
+    what = "free simulation"
+    if isfinite(found.horizon):
+        what = f"predictions over {found.horizon:.3g} s"
+    return Table(f"RMS error of {what}", heads, rows)
+
+
+def _worse(share: float) -> str:
+    """The tone of an error that is larger than that of the mean."""
+    return "open" if share > 1 else ""
 
 
 def _range_of(error: RMSError) -> str:

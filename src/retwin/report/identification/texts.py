@@ -8,6 +8,7 @@ from math import floor, isfinite, isnan, log10
 from retwin.evaluation.identification import Direction, Identification, ParameterEstimate, RMSError
 from retwin.evaluation.identification.parameters import WIDEST
 from retwin.update.identification.posterior import Posterior
+from retwin.update.identification.windows import state_based
 
 WHITE = 0.01
 """p-value below which a residual is not taken for white noise, or depends on an input."""
@@ -99,7 +100,7 @@ def percent(ratio: float) -> str:
 
 def findings(found: Identification) -> list[str]:
     """What a reader must know, in sentences, the most important first."""
-    parts = (_errors, _begins, _open, _residuals, _limits)
+    parts = (_errors, _horizon, _begins, _open, _residuals, _limits)
     return [sentence for each in parts for sentence in each(found)]
 
 
@@ -127,14 +128,23 @@ def _errors(found: Identification) -> Iterator[str]:
     where = "On held-out measurements" if part == "validation" else "On the measurements used"
     errors = list(found.errors(part).items())
     units = {each.name: each.unit for each in found.outputs}
+    means = {each.name: each.mean for each in found.outputs}
+    simulated = "in free simulation"
+    if isfinite(found.horizon):
+        simulated = f"over {found.horizon:.3g} s from estimated starts"
     for name, each in errors[:SENTENCES]:
         unit = "" if units[name] == "1" else f" {units[name]}"
         went = "went"
         if each.interval is not None:
             went = "fell" if each.interval[1] < 1 else "rose" if each.interval[0] > 1 else "went"
+        mean = means[name]
+        compared = f"the record's mean alone has {significant(mean)}{unit}"
+        if each.after > mean:
+            compared = f"worse than the record's mean, which has {significant(mean)}{unit}"
         yield (
-            f"{where}, the RMS error of {name} in free simulation {went} from "
-            f"{significant(each.before)} to {significant(each.after)}{unit}: {change(each)}."
+            f"{where}, the RMS error of {name} {simulated} {went} from "
+            f"{significant(each.before)} to {significant(each.after)}{unit}: {change(each)}; "
+            f"{compared}."
         )
     if len(errors) > SENTENCES:
         better = sum(each.ratio < 1 for _, each in errors)
@@ -146,6 +156,46 @@ def _errors(found: Identification) -> Iterator[str]:
         yield (
             "Nothing was held out: these errors are of the measurements that the parameters were "
             "fitted to, and smaller than those of others."
+        )
+
+
+def _horizon(found: Identification) -> Iterator[str]:
+    """Over which time parameters were fitted, and why; what would be needed where it matters."""
+    result = found.found
+    if isinstance(result, Posterior):
+        return
+    free = next((each.error for each in result.horizons if each.length is None), None)
+    if isfinite(result.horizon):
+        why = "as was asked for"
+        if result.horizons:
+            why = (
+                "since the effects of a start last until the end of the record, as in integrating "
+            )
+            why += "and unstable plants, where errors grow with time"
+        yield (
+            f"The parameters were fitted in windows of {result.horizon:.3g} s whose starts were "
+            f"estimated, {why}."
+        )
+        if result.horizons and free is None:
+            yield "A simulation of the whole record fails."
+        elif free is not None and isfinite(free):
+            yield (
+                "With parameters that were fitted to whole records, errors of predictions of parts "
+                f"left out are {free:.3g} times as large."
+            )
+    elif len(result.horizons) > 1:
+        yield (
+            "Effects of a start last until the end of the record, as in integrating and unstable "
+            "plants. Whole records were used, since parameters fitted in windows, whose starts "
+            "are estimated, predict parts left out no better."
+        )
+    elif result.lasting and not state_based(found.twin):
+        yield (
+            "Effects of early commands last until the end of the record, as in integrating and "
+            "unstable plants, where errors of the start and of disturbances grow with time and "
+            "decide the parameters. Windows whose starts are estimated would avoid that, but the "
+            "states of this twin cannot be set: write its equations as a StateTwin, or give short "
+            "records that begin as the twin does."
         )
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from collections import namedtuple
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from retwin.checks import require
 from retwin.compiler import c_source
 from retwin.twins.compiled.program import OPERATIONS, Node, Program
 from retwin.twins.compiled.trace import traced
@@ -74,6 +76,33 @@ class Model:
             }
             made[what] = ([node for node in needed if node.op in OPERATIONS], constants)
         return made
+
+    def delayed(self, delays: Sequence[tuple[int, int]]) -> Model:
+        """The model whose commands, of these indices, are delayed by parameters of these indices.
+
+        Its commands are those of `interpolation.delayed`.
+        """
+        program, count = Program(), len(self.variables["u"])
+        sizes = {letter: len(nodes) for letter, nodes in self.variables.items()}
+        variables = {
+            letter: tuple(program.variable(f"{letter}[{i}]") for i in range(size))
+            for letter, size in (sizes | {"u": count + len(delays)}).items()
+        }
+        known = {
+            node.index: made
+            for letter, nodes in self.variables.items()
+            for node, made in zip(nodes, variables[letter], strict=False)
+        }
+        for k, (place, parameter) in enumerate(delays):
+            moved = variables["p"][parameter] * variables["u"][count + k]
+            known[self.variables["u"][place].index] = variables["u"][place] + moved
+        for node in self.program.needed([*self.slope, *self.outputs]):
+            if node.op in OPERATIONS:
+                known[node.index] = program.node(node.op, *(known[a.index] for a in node.args))
+            elif node.op == "constant":
+                known[node.index] = program.constant(float(node.value))
+        slope, outputs = ([known[node.index] for node in own] for own in (self.slope, self.outputs))
+        return Model(program, variables, slope, outputs, self.discrete)
 
     @cached_property
     def source(self) -> str:
@@ -202,3 +231,23 @@ def trace_model(
         letter: tuple(group) for letter, group in zip("xup", groups, strict=True)
     }
     return Model(program, variables, slope, made, discrete)
+
+
+def with_parameters(function: Callable[..., Any] | None) -> Callable[..., Any]:
+    """A function of x, u and p, where the user's may leave out p."""
+    require(
+        callable(function),
+        "output",
+        expected="functions of x, u and p",
+        got=repr(function),
+        remedy="give functions that can be called",
+    )
+    assert function is not None
+    places = [
+        each
+        for each in inspect.signature(function).parameters.values()
+        if each.default is each.empty and each.kind is not each.VAR_KEYWORD
+    ]
+    if len(places) == 2 and all(each.kind is not each.VAR_POSITIONAL for each in places):
+        return lambda x, u, p: function(x, u)
+    return function

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from retwin.compiler import call, compiled
 from retwin.twins.compiled.model import Model
-from retwin.twins.interpolation import cubic_coefficients
+from retwin.twins.interpolation import cubic_coefficients, delayed
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +32,8 @@ class Steps:
         Steps of the integration per sample.
     interpolation : str
         Of the commands between samples.
+    delays : tuple of (int, int)
+        Indices of the commands with a dead time, and of the parameters that are these.
 
     """
 
@@ -39,6 +41,7 @@ class Steps:
     period: float
     substeps: int
     interpolation: str
+    delays: tuple[tuple[int, int], ...] = ()
 
     def run(
         self,
@@ -130,7 +133,7 @@ class Steps:
         first: int,
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """See `filter`, for one trajectory after the other."""
-        c = cubic_coefficients(_double(commands), self.interpolation)[:, first:].numpy()
+        c = self.coefficients(_double(commands), _double(theta), first).numpy()
         process, measured, changes, spread = given
         if changes is None:
             changes = np.zeros((*c.shape[:2], len(self.model.variables["p"])))
@@ -220,7 +223,7 @@ class Steps:
         first: int = 0,
     ) -> tuple[Tensor, Tensor]:
         """The same as `run` for double tensors, with gradient by both."""
-        c = cubic_coefficients(commands, self.interpolation)[:, first:]
+        c = self.coefficients(commands, theta, first)
         p, start = self._parted(theta.unbind(1))
         constant = p
         x, outputs, states = list(start), [], []
@@ -237,6 +240,23 @@ class Steps:
             if kicks is not None:
                 x = [own + kick for own, kick in zip(x, _double(kicks[:, t].T), strict=True)]
         return torch.stack(outputs, 1), torch.stack(states, 1)
+
+    def coefficients(self, commands: Tensor, theta: Tensor, first: int = 0) -> Tensor:
+        """Polynomials (n, T, 4, .) of the model's commands from each sample to the next."""
+        if self.delays:
+            places, parameters = (list(each) for each in zip(*self.delays, strict=True))
+            commands = delayed(commands, places, theta[:, parameters], self.period)
+        return cubic_coefficients(commands, self.interpolation)[:, first:]
+
+    def acting(self, commands: NDArray, theta: NDArray) -> NDArray:
+        """Commands (n, T, d_u) as they act at each sample, after their dead times."""
+        if not self.delays:
+            return commands
+        c = self.coefficients(_double(commands), _double(theta))[:, :, 0].numpy()
+        made, moved = c[..., : commands.shape[2]], c[..., commands.shape[2] :]
+        for k, (place, parameter) in enumerate(self.delays):
+            made[..., place] += theta[:, parameter, None] * moved[..., k]
+        return made
 
     def _advanced(self, c: Tensor, x: list[Tensor], p: Sequence[Tensor]) -> list[Tensor]:
         """The states one sample later."""
@@ -259,7 +279,7 @@ class Steps:
 
     def _arrays(self, commands: NDArray, theta: NDArray, first: int = 0) -> list[NDArray]:
         """Coefficients of the commands, parameters and starts, as the compiled model takes them."""
-        c = cubic_coefficients(_double(commands), self.interpolation)[:, first:].numpy()
+        c = self.coefficients(_double(commands), _double(theta), first).numpy()
         columns = self._parted(list(theta.T))
         starts = [np.stack(own, 1) if own else np.zeros((len(theta), 0)) for own in columns]
         return [np.ascontiguousarray(each, np.float64) for each in (c, *starts)]

@@ -12,9 +12,11 @@ import numpy as np
 from retwin.checks import one_of
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
+from retwin.threads import one_thread
 from retwin.twins.twin import checked_seed
 from retwin.update.blackbox.arx import fit_arx
 from retwin.update.blackbox.estimate import BlackBox
+from retwin.update.blackbox.lstm import fit_lstm
 from retwin.update.blackbox.narx import fit_narx
 from retwin.update.blackbox.neural import fit_neural_ss
 
@@ -24,17 +26,19 @@ BLACK_BOXES: Mapping[str, Callable[[Trajectories, int, Progress | None], BlackBo
     "arx": fit_arx,
     "narx": fit_narx,
     "neural_ss": fit_neural_ss,
+    "lstm": fit_lstm,
 }
 """By name, which is that of the source in a study too."""
 
 
+@one_thread()
 def fit_black_box(
     observed: Trajectories, kind: str, *, seed: int = 0, progress: Progress | None = None
 ) -> BlackBox:
     """A model of the outputs by the commands, from calibration records alone.
 
     Its order and the strength of its prior are those with the least error of held-out blocks in
-    free simulation. Bands are calibrated by the same blocks.
+    free simulation; an LSTM has neither. Bands are calibrated by the same blocks.
 
     Parameters
     ----------
@@ -42,7 +46,7 @@ def fit_black_box(
         Healthy calibration trajectories with commands; masked samples are not used.
     kind : str
         "arx", a linear model; "narx", a polynomial of past samples; "neural_ss", a linear
-        state-space model with a small network inside its equations.
+        state-space model with a small network inside its equations; "lstm", a recurrent network.
     seed : int
         Of the first weights of a network, at least 0.
     progress : callable, optional
@@ -51,7 +55,7 @@ def fit_black_box(
     Returns
     -------
     BlackBox
-        Its `twin` simulates from commands.
+        Its `twin` simulates from commands: a `DynamicsTwin`, or of "lstm" a `CorrectedTwin`.
 
     Raises
     ------

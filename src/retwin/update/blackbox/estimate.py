@@ -1,7 +1,7 @@
 """What all black-box models share: checks, estimation on free simulation, and the result.
 
-A black-box model is a `StateTwin` whose equations know nothing of the system. So it is estimated,
-simulated, saved and used as a twin with corrected dynamics is.
+A black-box model, but the LSTM, is a `StateTwin` whose equations know nothing of the system. So it
+is estimated, simulated, saved and used as a twin with corrected dynamics is.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from retwin.twins.parametric import Parameter
 from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
+from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.estimation import Estimation, Point, correlation_time
 from retwin.update.dynamics.fitting import assembled
 from retwin.update.dynamics.left_out import held_out
@@ -60,10 +61,11 @@ class BlackBox:
 
     Attributes
     ----------
-    twin : DynamicsTwin
+    twin : DynamicsTwin or CorrectedTwin
         The model, as a distribution of outputs.
     figures : dict of str to float
-        `order`, the number of past samples that the model has, or that its linear part has;
+        `order`, the number of past samples that the model has, or that its linear part has, which
+        an LSTM has not;
         `parameters`, their number; `rms`, the error of free simulation over the calibration record,
         and `held_out`, that of blocks left out, in output units, or relative to each output's
         standard deviation where units differ.
@@ -72,7 +74,7 @@ class BlackBox:
 
     """
 
-    twin: DynamicsTwin
+    twin: DynamicsTwin | CorrectedTwin
     figures: dict[str, float]
     seconds: float
 

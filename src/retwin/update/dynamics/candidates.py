@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
+from retwin.twins.interpolation import delays_tried
 from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.estimation import Estimation, correlation_time
@@ -92,7 +93,7 @@ def without_discrepancy(
     )
     for _ in range(ERROR_STEPS):
         estimation = replace(estimation, variance=estimation.power(found.residual))
-        found = estimation.minimised(found)
+        found = estimation.minimised(_with_best_delays(estimation, found))
     estimation = replace(estimation, variance=estimation.power(found.residual))
     combinations, there = estimation.confounded(found) / HELD, found.point.shared
 
@@ -100,6 +101,27 @@ def without_discrepancy(
         return combinations @ (shared - there), combinations
 
     return replace(estimation, absorbed=held if len(combinations) else None), found
+
+
+def _with_best_delays(estimation: Estimation, found: Linearised) -> Linearised:
+    """The simulation at those dead times from which a step of the other unknowns leaves least."""
+    twin, unknowns = estimation.twin, estimation.unknowns
+
+    def rest(at: Linearised, place: int) -> float:
+        kept, mean = np.delete(np.arange(unknowns.count), place), unknowns.mean.copy()
+        mean[place] = at.point.shared[place]
+        own = replace(estimation, unknowns=replace(unknowns, mean=mean).only(kept))
+        return own.rest(replace(at, point=Point(at.point.shared[kept], at.point.starts)))
+
+    for parameter in {place for _, place in twin.delay_places}:
+        for place in np.flatnonzero(unknowns.matrix[parameter]).tolist():
+            tried = [found]
+            for value in delays_tried(unknowns.low[place], unknowns.high[place], twin.rate):
+                shared = found.point.shared.copy()
+                shared[place] = value
+                tried.append(estimation.linearised(Point(shared, found.point.starts)))
+            found = min(tried, key=lambda at: rest(at, place))
+    return found
 
 
 def searched(
@@ -179,7 +201,7 @@ def _forms(
     """The corrected equations with each form that is tried, at the parameters of a point."""
     unknowns = alone.unknowns
     twin = _with_starts(alone.twin, unknowns, point)
-    both = (visited, alone.commands)
+    both = (visited, alone.acting(point))
     for form in settings.forms:
         yield CorrectedEquations.distinct(twin, form, settings, both, unknowns.matrix)
 
@@ -278,7 +300,7 @@ def _followed(
         now = estimation.minimised(now)
         # What a network has in common with parameters is that over the states that it leads to.
         visited = estimation.simulated(now.point)[1][..., :states]
-        equations = equations.visiting(visited, estimation.commands)
+        equations = equations.visiting(visited, estimation.acting(now.point))
         absorbed = _absorbed(equations, alone)
         estimation = replace(estimation, absorbed=absorbed)
         ratio = np.mean(estimation.power(now.residual) / power)

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import one_of, require
+from retwin.twins.compiled.model import with_parameters
 from retwin.twins.compiled.program import Node
 from retwin.twins.parametric import Parameter
-from retwin.twins.state_twin import StateTwin, with_parameters
+from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.network import TanhNetwork
@@ -226,7 +227,8 @@ class CorrectedEquations:
         )
 
         def corrected(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
-            slope = list(function(x, u, named(*p[:own])))
+            returned = function(x, u, named(*p[:own]))
+            slope = [returned] if getattr(returned, "ndim", 1) == 0 else list(returned)
             found = self.discrepancies(self.domain.scaled([*x, *u]), p[own:])
             for equation, each in zip(self.equations, found, strict=True):
                 i = equation.index
@@ -321,7 +323,7 @@ class CorrectedEquations:
 
 def _some(states: NDArray, commands: NDArray) -> tuple[NDArray, NDArray]:
     """At most so many samples (K, d_x) and (K, d_u) of states and commands."""
-    x, u = (each.reshape(-1, each.shape[2]) for each in (states, commands))
+    x, u = (each.reshape(np.prod(each.shape[:2]), each.shape[2]) for each in (states, commands))
     some = np.linspace(0, len(x) - 1, min(len(x), COMPARED)).astype(int)
     return x[some], u[some]
 

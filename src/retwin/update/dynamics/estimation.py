@@ -108,6 +108,10 @@ class Estimation:
         """Outputs (n, T, d_y) and states (n, T, d_x)."""
         return self.twin.steps().run(self.commands, self.theta(point))
 
+    def acting(self, point: Point) -> NDArray:
+        """Commands (n, T, d_u) as they act, after their dead times."""
+        return self.twin.steps().acting(self.commands, self.theta(point))
+
     def residual(self, point: Point) -> NDArray:
         """Measured minus simulated outputs (n, T, d_y); 0 where a sample does not count."""
         return np.where(self.seen, self.measured - self.simulated(point)[0], 0.0)
@@ -212,6 +216,10 @@ class Estimation:
                 # What did not act at the start may act now, and its unit was without meaning.
                 unit = np.where(unit > WIDEST * curvature.unit, curvature.unit, unit)
         return at
+
+    def rest(self, at: Linearised) -> float:
+        """The objective in nats that a Gauss-Newton step from a point would leave."""
+        return self._expanded(at)[0] - self.gain(at) if at.finite else np.inf
 
     def gain(self, at: Linearised) -> float:
         """The decrease of the objective, in nats, by a Gauss-Newton step from a point."""

@@ -16,6 +16,7 @@ from retwin.checks import require
 from retwin.data.measured import doubtful, unmeasured
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
+from retwin.threads import one_thread
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
@@ -91,6 +92,7 @@ class FittedDynamics:
         return None
 
 
+@one_thread()
 def fit_dynamics(
     twin: StateTwin | ParametricTwin,
     observed: Trajectories,
@@ -322,7 +324,7 @@ def _sizes(
     own, more = len(equations.twin.states), 2 if memory else 0
     first = len(found.shared) - len(equations.coefficients) - more
     psi = found.shared[first : len(found.shared) - more]
-    commands = estimation.commands.reshape(len(states), -1)
+    commands = estimation.acting(found).reshape(len(states), -1)
     values = equations.values(states[:, :own], commands, psi)
     sizes = np.abs(psi[equations.weights]) * np.sqrt(np.mean(values**2, axis=0))
     names = [equations.coefficients[place].name for place in equations.weights]

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from retwin.compiler import c_source, call, compiled
 from retwin.twins.compiled.model import Model
-from retwin.twins.interpolation import cubic_coefficients
 from retwin.update.dynamics.prediction import root_of, whitened
 from retwin.update.dynamics.twin import DynamicsTwin
 
@@ -121,7 +120,7 @@ class Record:
             See `NoiseVariances`.
 
         """
-        library = _library(self.twin.equations.model)
+        library = _library(self.twin.equations.stepped)
         given = (variants, slopes, more)
         sums = self._in_numpy(*given) if library is None else self._in_c(library, *given)
         squares, logs, gradient, curvature = sums
@@ -222,9 +221,9 @@ class Record:
 
     def _coefficients(self, commands: NDArray) -> NDArray:
         """Cubic polynomials (J, T, 4, d_u) of commands (J, T, d_u) between samples."""
-        interpolation = self.twin.equations.steps().interpolation
         given = torch.tensor(commands, dtype=torch.float64)
-        made: NDArray = cubic_coefficients(given, interpolation).numpy()
+        theta = torch.tensor(np.tile(self._theta, (len(commands), 1)))
+        made: NDArray = self.twin.equations.steps().coefficients(given, theta).numpy()
         return made
 
 

@@ -19,9 +19,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from retwin.twins.compiled.model import with_parameters
 from retwin.twins.parametric import Parameter
 from retwin.twins.state import State
-from retwin.twins.state_twin import StateTwin, with_parameters
+from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.terms import WIDEST
 

@@ -8,6 +8,7 @@ results are the same bytes.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +74,10 @@ class OnlineFilter:
     def start(self, count: int) -> FilterState:
         """What is known of so many systems before their first sample, which may be anywhere."""
         theta, spread = self.twin.filter.start(count, known_start=False)
-        earlier = TAPS if self.twin.equations.interpolation == "spline" else 1
+        twin = self.twin.equations
+        delays = [self.twin.values[place] for _, place in twin.delay_places]
+        earlier = TAPS if twin.interpolation == "spline" else 1
+        earlier += ceil(max(delays) * twin.rate) + 1 if delays else 0
         commands = np.full((count, earlier, len(self.twin.inputs)), np.nan)
         states = theta[:, -spread.shape[1] :]
         return FilterState(states, spread, states, commands)

@@ -16,6 +16,7 @@ from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.corrected import correctable
 from retwin.update.dynamics.domain import Domain
+from retwin.update.forecast_errors import ForecastErrors
 
 __all__ = ["read_fields", "write_fields"]
 
@@ -38,11 +39,13 @@ DOMAIN = ("low", "high", "mean", "speed")
 
 def write_fields(folder: str | Path, fields: Mapping[str, Any]) -> None:
     """Write the fields of a `DynamicsTwin`, its equations as operations on numbers."""
+    forecast: ForecastErrors | None = fields["forecast"]
     about: dict[str, Any] = {
         "equations": equations_of(fields["equations"]),
         "corrected": list(fields["corrected"]),
         "emulated": fields["emulated"],
         "case": fields["case"],
+        "forecast": forecast and forecast.values,
     }
     arrays = {name: fields[name] for name in ARRAYS}
     arrays |= {f"domain_{name}": getattr(fields["domain"], name) for name in DOMAIN}
@@ -75,6 +78,7 @@ def read_fields(folder: str | Path) -> dict[str, Any]:
             "corrected": correctable(equations, about["corrected"]),
             "emulated": one_of("emulated", about["emulated"], (True, False)),
             "case": about["case"],
+            "forecast": ForecastErrors.of(about.get("forecast")),
         }
 
 

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -25,9 +26,10 @@ from retwin.update.dynamics.estimation import Estimation, root
 from retwin.update.dynamics.filtering import DynamicsFilter
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.prediction import Prediction
-from retwin.update.dynamics.saved import read_fields, write_fields
+from retwin.update.dynamics.saved import KIND, read_fields, write_fields
 from retwin.update.dynamics.simulation import FreeSimulation
 from retwin.update.dynamics.unknowns import unknowns_of
+from retwin.update.forecast_errors import ForecastErrors
 from retwin.update.training_range import OutsideTrainingWarning
 
 __all__ = ["DynamicsTwin"]
@@ -73,6 +75,8 @@ class DynamicsTwin:
         Whether the calibration data were emulated.
     case : str
         The name of the case that it was fitted for; the command line reads it.
+    forecast : ForecastErrors, optional
+        Errors of predictions from measurements, by how far ahead; None where none were calibrated.
 
     """
 
@@ -89,6 +93,8 @@ class DynamicsTwin:
     corrected: tuple[str, ...]
     emulated: bool = False
     case: str = ""
+    forecast: ForecastErrors | None = None
+    kind: ClassVar[str] = KIND
 
     @property
     def inputs(self) -> Channels:

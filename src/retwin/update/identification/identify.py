@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import overload
 
 import numpy as np
@@ -14,9 +17,11 @@ from scipy import stats
 from retwin.checks import require
 from retwin.data.measured import measured_only, unmeasured
 from retwin.data.trajectories import Trajectories
+from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
 from retwin.update.identification.bayes import infer_posterior
+from retwin.update.identification.horizon import Candidate, choose_length, lasting
 from retwin.update.identification.identifiability import (
     CHI2_95,
     MIN_TRAJECTORIES,
@@ -37,6 +42,7 @@ from retwin.update.identification.search import (
     Optimum,
     Search,
 )
+from retwin.update.identification.windows import state_based
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +80,13 @@ class Updated:
         The loss that was minimised.
     scale : float
         The residual beyond which a robust loss grows slower.
+    horizon : float
+        Length in s of the windows into which records were cut, whose starts were estimated;
+        infinite for whole records.
+    horizons : tuple of Candidate
+        What was compared for it, the chosen one first; empty where there was no choice.
+    lasting : bool
+        Whether effects of a start or of early commands last until the end of the record.
 
     """
 
@@ -90,6 +103,9 @@ class Updated:
     reason: str
     loss: Loss
     scale: float
+    horizon: float = np.inf
+    horizons: tuple[Candidate, ...] = ()
+    lasting: bool = False
 
 
 @overload
@@ -101,6 +117,7 @@ def identify(
     seed: int,
     rate: float | None = ...,
     processes: int = ...,
+    horizon: float | None = ...,
     progress: Progress | None = ...,
 ) -> Updated: ...
 
@@ -126,6 +143,7 @@ def identify(
     seed: int,
     rate: float | None = None,
     processes: int = 1,
+    horizon: float | None = None,
     progress: Progress | None = None,
 ) -> Updated | Posterior:
     """Estimate a twin's own parameters from measured outputs.
@@ -154,6 +172,10 @@ def identify(
     processes : int
         Worker processes over which values of the parameters are distributed; 1 for twins that use
         all cores.
+    horizon : float, optional
+        Time in s over which the twin is simulated from starts that are estimated, for a search and
+        a twin with states; infinite for whole records. By default it is chosen where effects of the
+        start last until the end of the record, as in integrating and unstable plants.
     progress : callable, optional
         Called with the share of the work that is done.
 
@@ -189,12 +211,84 @@ def identify(
         missing = unmeasured(observed)
         observed = measured_only(observed) if missing else observed
     found: Updated | Posterior
-    with misfit_of(twin, observed, seed=seed, rate=rate, processes=processes) as misfit:
-        if isinstance(method, MCMC | NPE):
+    begin = partial(misfit_of, seed=seed, rate=rate, processes=processes)
+    if isinstance(method, MCMC | NPE):
+        with begin(twin, observed) as misfit:
             found = infer_posterior(misfit, method, progress)
-        else:
-            found = _fitted(misfit, method, missing, progress)
+    else:
+        found = _searched(twin, observed, method, horizon, (begin, missing, progress))
+        for note in filter(None, [found.identifiability.warning, missing]):
+            warnings.warn(note, stacklevel=2)
     return replace(found, seconds=time.perf_counter() - began)
+
+
+def _searched(
+    twin: ParametricTwin,
+    observed: Trajectories,
+    method: LeastSquares | Evolution,
+    horizon: float | None,
+    how: tuple[Callable[..., AbstractContextManager[Misfit]], str, Progress | None],
+) -> Updated:
+    """The parameters that fit best over a horizon that is given or chosen."""
+    (begin, missing, progress), found = how, None
+    length, candidates = _samples_of(horizon, twin, observed), []
+    if length is None:
+        choice = horizon is None and state_based(twin)
+        try:
+            with begin(twin, observed) as misfit:
+                found, stride = _fitted(misfit, method, missing, progress), misfit.stride
+        except InputError:
+            if not choice or not lasting(twin, observed):
+                raise
+            stride = 1
+        if found is not None:
+            found = replace(found, lasting=lasting(found.twin, observed))
+            if not (choice and found.lasting):
+                return found
+
+        def fit(part: Trajectories, windows: int | None) -> ParametricTwin:
+            own = twin if windows or found is None else found.twin
+            with begin(own, part, length=windows) as misfit:
+                return _fitted(misfit, LeastSquares(1, method.loss), "", None).twin
+
+        candidates = choose_length(observed, fit, stride, whole=found is not None)
+        length = candidates[0].length if candidates else None
+        if length is None:
+            require(
+                found is not None,
+                "observed",
+                expected="records of 200 samples or more, for a twin that cannot simulate them",
+                got=f"{observed.steps} samples",
+                remedy="choose other starts of the parameters, or give longer records",
+            )
+            assert found is not None
+            return replace(found, horizons=tuple(candidates))
+    with begin(twin, observed, length=length) as misfit:
+        again = _fitted(misfit, method, missing, progress)
+    return replace(again, horizon=length / observed.rate, horizons=tuple(candidates), lasting=True)
+
+
+def _samples_of(horizon: float | None, twin: ParametricTwin, observed: Trajectories) -> int | None:
+    """The samples of a horizon that is given; None for one to be chosen, or for whole records."""
+    if horizon is None or horizon == np.inf:
+        return None
+    require(
+        state_based(twin),
+        "horizon",
+        expected="none for a twin without states",
+        got=f"{horizon:g} s for a {type(twin).__name__}",
+        remedy="starts of windows can only be estimated where the equations of the states are "
+        "known: write them as a StateTwin, or leave the horizon out",
+    )
+    longest = observed.steps / observed.rate
+    require(
+        2 / observed.rate <= horizon <= longest,
+        "horizon",
+        expected=f"a time from {2 / observed.rate:g} to {longest:g} s, the longest record",
+        got=f"{horizon:g} s",
+        remedy="leave it out to have it chosen",
+    )
+    return round(horizon * observed.rate)
 
 
 def _fitted(
@@ -211,11 +305,13 @@ def _fitted(
     if (kept != best.values).any():
         best = replace(best, values=tuple(kept.tolist()))
         optima = [(best, point), *optima[1:]]
-    for note in filter(None, [found.warning, missing]):
-        warnings.warn(note, stacklevel=3)
     count = len(misfit.observed)
     half = stats.t.ppf(0.975, max(count - 1, 1)) * errors
     values = np.array(best.values)
+    if misfit.windows is not None:
+        values = misfit.windows.with_starts(values)
+        best = replace(best, values=tuple(values.tolist()))
+        optima = [(best, point), *optima[1:]]
     unknown = ""
     if np.isnan(errors).any():
         alone = "" if count < MIN_TRAJECTORIES else ", of which one alone determines a parameter"

@@ -18,6 +18,7 @@ from retwin.twins.collected import SimulationError
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.step_error import StepWarning
 from retwin.twins.twin import checked_seed, checked_stride
+from retwin.update.identification.windows import Windows, sampled, state_based, windows_of
 
 
 class Misfit:
@@ -40,6 +41,8 @@ class Misfit:
         Worker processes, over which values of the parameters are distributed.
     processes : int
         Number of these.
+    windows : Windows, optional
+        Where the starts of simulations are estimated; otherwise they are those of the twin.
 
     Attributes
     ----------
@@ -72,6 +75,7 @@ class Misfit:
         seed: int,
         pool: ProcessPool | None = None,
         processes: int = 1,
+        windows: Windows | None = None,
     ) -> None:
         self.twin = twin
         self.observed = observed
@@ -82,6 +86,7 @@ class Misfit:
         self.twin_runs = 0
         self._pool = pool
         self._processes = processes
+        self.windows = windows
         self._commands = observed.commands.astype(np.float64)
         self._measured = observed.observed[:, ::stride].astype(np.float64)
         self.present = self.outputs(np.array([twin.values]))[0]
@@ -98,6 +103,8 @@ class Misfit:
         each = self.present.std(axis=(0, 1))
         alike = len(set(observed.outputs.units)) == 1
         self.unit = np.ones(len(each)) if alike else np.maximum(each, 1e-12)
+        if windows is not None:
+            self.unit = windows.unit
         self.spread = float(np.sqrt(np.mean((each / self.unit) ** 2)))
 
     @property
@@ -113,6 +120,8 @@ class Misfit:
     def outputs(self, theta: NDArray) -> NDArray:
         """Simulated outputs (m, n, P, d_y) at parameters (m, k); NaN where a simulation failed."""
         self.twin_runs += len(theta) * len(self._commands)
+        if self.windows is not None:
+            return np.stack([self.windows.outputs(own) for own in theta])[:, :, :: self.stride]
         work = (self.twin, self._commands, self.stride, self.seed)
         if self._pool is None or len(theta) < 2:
             return _outputs(*work, theta)
@@ -133,7 +142,11 @@ class Misfit:
 
         None where the twin gives none that are finite.
         """
-        made = self.twin.sensitivities(self._commands, theta)
+        made = (
+            self.twin.sensitivities(self._commands, theta)
+            if self.windows is None
+            else self.windows.derivatives(theta)
+        )
         if made is None or not np.isfinite(made).all():
             return None
         self.twin_runs += len(self._commands)
@@ -153,16 +166,23 @@ def misfit_of(
     seed: int,
     rate: float | None,
     processes: int,
+    length: int | None = None,
 ) -> Iterator[Misfit]:
     """The misfit of a twin, with worker processes during the block if `processes` exceeds 1.
+
+    The starts of windows of `length` samples, or those of whole records that are not given, are
+    estimated if the twin has states.
 
     Raises InputError if twin and data do not fit each other.
     """
     checked_seed(seed)
     whole("processes", processes, least=1)
     stride = _checked(twin, observed, rate)
-    if processes == 1:
-        yield Misfit(twin, observed, stride=stride, seed=seed)
+    windows = None
+    if state_based(twin):
+        windows = windows_of(twin, observed, length, sampled(observed.mask, stride))
+    if processes == 1 or windows is not None:
+        yield Misfit(twin, observed, stride=stride, seed=seed, windows=windows)
         return
     with worker_pool(processes) as pool:
         yield Misfit(twin, observed, stride=stride, seed=seed, pool=pool, processes=processes)

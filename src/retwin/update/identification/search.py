@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, differential_evolution, least_squares
 from scipy.stats.qmc import LatinHypercube
 
-from retwin.checks import one_of, whole
+from retwin.checks import one_of, require, whole
 from retwin.progress import Progress
+from retwin.twins.interpolation import delays_tried
 from retwin.update.identification.misfit import Misfit
 
 DIFFERENCE = 1e-3
@@ -162,7 +163,7 @@ class Search:
         robust = self.method.loss != "linear"
         found = []
         for done, start in enumerate(starts, 1):
-            found.append(self.descend(start))
+            found.append(self._from(start))
             if self.progress is not None:
                 self.progress(done / len(starts) * (0.5 if robust else 1.0))
         if robust:
@@ -171,12 +172,44 @@ class Search:
             middle = float(np.median(np.abs(best.fun[self.misfit.seen.ravel()])))
             self.loss = self.method.loss
             self.scale = max(1.4826 * middle, 1e-9 * self.misfit.spread)
+            require(
+                self.scale > 0,
+                "observed",
+                expected="outputs that change, or that the twin does not predict exactly",
+                got="outputs, measured and simulated, that never change and are equal",
+                remedy="give a record in which the system moves, and check its columns",
+            )
             for done, each in enumerate(found, 1):
                 found[done - 1] = self.descend(each.x)
                 if self.progress is not None:
                     self.progress(0.5 + 0.5 * done / len(starts))
         optima = [self._optimum(*each) for each in zip(starts, found, strict=True)]
         return sorted(optima, key=lambda each: each[0].objective)
+
+    def _from(self, start: NDArray) -> OptimizeResult:
+        """The optimum from a start, whose dead times are the best before and after the search."""
+        found = self.descend(self._with_best_delays(start))
+        again = self._with_best_delays(found.x)
+        return self.descend(again) if (again != found.x).any() else found
+
+    def _with_best_delays(self, point: NDArray) -> NDArray:
+        """A point (k,) with the dead times from which a step of the others leaves least."""
+        twin = self.misfit.twin
+        delays = set(getattr(twin.twin, "delays", {}).values())
+
+        def rest(tried: NDArray, place: int) -> float:
+            residual = self.residuals(tried[None])[0]
+            by_others = np.delete(self.jacobian(tried, sides=1, residual=residual), place, axis=1)
+            step = np.linalg.lstsq(by_others, residual)[0]
+            return float(np.sum((residual - by_others @ step) ** 2))
+
+        for place, each in enumerate(twin.parameters):
+            if delays & set(each.places):
+                values = delays_tried(each.low, each.high, twin.rate) - each.low
+                tried = np.tile(point, (len(values) + 1, 1))
+                tried[1:, place] = values / self.width[place]
+                point = min(tried, key=lambda each: rest(each, place))
+        return point
 
     def _evolved(self, now: NDArray, rng: np.random.Generator) -> NDArray:
         assert isinstance(self.method, Evolution)

@@ -8,6 +8,7 @@ from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.residual import Residual, segment
 from retwin.update.residual.sequence import SequenceMixture, SequenceResidual
 from retwin.update.residual.settings import Density, Flow, Mixture, Refinement
+from retwin.update.residual.stationary import StationaryNoise, StationaryResidual
 
 __all__ = [
     "Density",
@@ -18,6 +19,8 @@ __all__ = [
     "ResidualModel",
     "SequenceMixture",
     "SequenceResidual",
+    "StationaryNoise",
+    "StationaryResidual",
     "fit_residual",
     "infer_discrepancy",
     "load_residual",

@@ -40,6 +40,11 @@ from retwin.update.residual.segment_fitting import fit_segments
 from retwin.update.residual.sequence import SequenceMixture, SequenceResidual
 from retwin.update.residual.sequence_fitting import fit_sequence
 from retwin.update.residual.settings import Density, Mixture
+from retwin.update.residual.stationary import (
+    StationaryNoise,
+    StationaryResidual,
+    fit_stationary,
+)
 from retwin.update.residual.targets import Targets
 from retwin.update.surrogate import Surrogate
 from retwin.update.surrogate_error import surrogate_variance, warn_of_error
@@ -118,11 +123,27 @@ def fit_residual(
 ) -> SequenceResidual: ...
 
 
+@overload
+def fit_residual(
+    surrogate: Surrogate | Twin,
+    calibration: Trajectories,
+    correction: Correction,
+    density: StationaryNoise,
+    *,
+    seed: int,
+    calibrate_on: str | Mapping[str, Fault | None] = ...,
+    bounds: NDArray | None = ...,
+    segments: Segments | str = ...,
+    twin: Twin | None = ...,
+    progress: Progress | None = ...,
+) -> StationaryResidual: ...
+
+
 def fit_residual(
     surrogate: Surrogate | Twin,
     calibration: Trajectories,
     correction: Correction = DelayOffset(),  # noqa: B008 - a frozen config
-    density: Density | SequenceMixture = Mixture(),  # noqa: B008 - a frozen config
+    density: Density | SequenceMixture | StationaryNoise = Mixture(),  # noqa: B008 - frozen
     *,
     seed: int,
     calibrate_on: str | Mapping[str, Fault | None] = "healthy",
@@ -130,7 +151,7 @@ def fit_residual(
     segments: Segments | str = "commands",
     twin: Twin | None = None,
     progress: Progress | None = None,
-) -> ResidualModel | SequenceResidual:
+) -> ResidualModel | SequenceResidual | StationaryResidual:
     """Fit the residual model to measured trajectories, from outputs alone (Eq. 7–10).
 
     Parameters
@@ -142,8 +163,8 @@ def fit_residual(
         warning is given below three.
     correction : Correction
         The operator g, which defines z. The parameters of a sensor in it are fitted too.
-    density : Density or SequenceMixture
-        Family of distributions of z; a `SequenceMixture` for an operator with one z per sample,
+    density : Density, SequenceMixture or StationaryNoise
+        Family of distributions of z; one of the last two for an operator with one z per sample,
         which can be fitted to a single record.
     seed : int
         The same seed gives the same weights on the same machine.
@@ -166,8 +187,8 @@ def fit_residual(
 
     Returns
     -------
-    ResidualModel or SequenceResidual
-        The latter for a `SequenceMixture`.
+    ResidualModel, SequenceResidual or StationaryResidual
+        One of the last two for a `SequenceMixture` and `StationaryNoise`.
 
     Raises
     ------
@@ -182,7 +203,9 @@ def fit_residual(
     )
     remedy = "load the file with its case, or convert it"
     agree("calibration", calibration, surrogate, "that of the surrogate", remedy=remedy)
-    stepwise = correction.resolution == "step" or isinstance(density, SequenceMixture)
+    stepwise = correction.resolution == "step" or isinstance(
+        density, SequenceMixture | StationaryNoise
+    )
     keep, faults = _chosen(
         calibration, calibrate_on, getattr(correction, "severities", False), 1 if stepwise else 3
     )
@@ -203,6 +226,8 @@ def fit_residual(
         got=f"{int(used.mask.all(axis=2).sum())} samples with all outputs measured",
         remedy="check the mask; leave an output out that is never measured",
     )
+    if isinstance(density, StationaryNoise):
+        return _noted(fit_stationary(used, correction, density, found), outside, missing)
     if isinstance(density, SequenceMixture):
         sequence = fit_sequence(
             used, correction, density, context, found, seed=seed, bounds=bounds, progress=progress

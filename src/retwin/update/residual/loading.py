@@ -1,4 +1,4 @@
-"""`load_residual`: a saved residual model of either kind."""
+"""`load_residual`: a saved residual model of any kind."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ from pathlib import Path
 
 from retwin.serialisation.models import kind_of, refusing
 from retwin.update.residual.model import ResidualModel
+from retwin.update.residual.residual import Residual
 from retwin.update.residual.sequence import SequenceResidual
+from retwin.update.residual.stationary import StationaryResidual
+
+KINDS: dict[str, type[Residual]] = {
+    each.kind: each for each in (ResidualModel, SequenceResidual, StationaryResidual)
+}
 
 
-def load_residual(
-    folder: str | Path, rate: float | None = None
-) -> ResidualModel | SequenceResidual:
-    """The residual model that `folder` holds, of either kind; InputError if it holds none.
+def load_residual(folder: str | Path, rate: float | None = None) -> Residual:
+    """The residual model that `folder` holds, of any kind; InputError if it holds none.
 
     `rate` in Hz is for files from before version 0.1.0 only, whose times were in samples.
     """
-    sequence = kind_of(folder) == SequenceResidual.kind
     with refusing(folder, expected="a residual model"):
-        return (SequenceResidual if sequence else ResidualModel).load(folder, rate)
+        return KINDS.get(kind_of(folder), ResidualModel).load(folder, rate)

@@ -236,8 +236,8 @@ class SequenceResidual(Residual):
             [_picked([each[block] for each in members], chosen) for block in range(len(self.sizes))]
         )
         first = torch.stack([part[0] for part in self.persistence.split(self.sizes)])
-        of_components = _autoregressive(torch.randn(n, steps, len(first), **made), first)
-        of_values = _autoregressive(
+        of_components = autoregressive(torch.randn(n, steps, len(first), **made), first)
+        of_values = autoregressive(
             torch.randn(n, steps, len(self.latent), **made), self.persistence
         )
         z = drawn_from.from_noise(torch.special.ndtr(of_components), of_values)
@@ -289,7 +289,7 @@ def _picked(members: Sequence[GaussianMixture], chosen: Tensor) -> GaussianMixtu
     return GaussianMixture(*(torch.stack(part)[chosen, row] for part in parts))
 
 
-def _autoregressive(noise: Tensor, coefficients: Tensor) -> Tensor:
+def autoregressive(noise: Tensor, coefficients: Tensor) -> Tensor:
     """A stationary first-order autoregression of unit variance from white noise (n, T, d)."""
     made = noise.cpu().numpy().astype(np.float64)
     for component, coefficient in enumerate(coefficients.double().tolist()):

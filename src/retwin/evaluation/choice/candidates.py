@@ -1,0 +1,135 @@
+"""`Candidates`: models of increasing complexity that a twin and some records allow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from retwin.data.segments import Segments
+from retwin.data.trajectories import Trajectories
+from retwin.evaluation.choice.settings import Choice
+from retwin.twins.parametric import ParametricTwin
+from retwin.twins.record_sampler import moves_and_rests
+from retwin.twins.state_twin import StateTwin
+from retwin.twins.twin import Twin
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.corrections import Additive, Correction, DelayOffset
+from retwin.update.dynamics import DynamicsTwin, FittedDynamics, fit_dynamics, state_names
+from retwin.update.identification import LeastSquares, Updated, identify
+from retwin.update.residual import StationaryNoise, fit_residual
+
+Model = CorrectedTwin | DynamicsTwin
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """The candidates that are fitted to the same records; what two of them share is fitted once.
+
+    Attributes
+    ----------
+    twin : Twin
+        The twin as it is given, or a surrogate of it.
+    records : Trajectories
+        Healthy ones with commands.
+    settings : Choice
+        The forms of the corrections.
+    seed : int
+        Of networks and searches.
+    case : str
+        The case that the models name.
+    original : Twin, optional
+        The twin of a surrogate, by which its error is measured.
+
+    """
+
+    twin: Twin
+    records: Trajectories
+    settings: Choice
+    seed: int
+    case: str = ""
+    original: Twin | None = None
+
+    @property
+    def fits(self) -> dict[str, Callable[[], Model]]:
+        """The candidates that the twin and the records allow, the simplest first."""
+        made: dict[str, Callable[[], Model]] = {"none": self.none}
+        if self.free is not None:
+            made["parameters"] = self.parameters
+        if self.segmented:
+            made["delay_offset"] = lambda: self.per_segment(DelayOffset())
+        if state_names(self.twin):
+            made["dynamics"] = lambda: self.dynamics
+        own = self.settings.correction
+        if own is not None and own != DelayOffset() and self.segmented:
+            made["segments"] = lambda: self.per_segment(own)
+        made["output"] = lambda: self.per_sample(self.identified)
+        if state_names(self.twin):
+            made["dynamics_output"] = lambda: self.per_sample(self.dynamics)
+        wanted = self.settings.candidates
+        return {name: fit for name, fit in made.items() if not wanted or name in wanted}
+
+    @property
+    def free(self) -> ParametricTwin | None:
+        """The twin with its free parameters; None where it has none."""
+        if isinstance(self.twin, StateTwin):
+            return self.twin.parametric() if self.twin.free else None
+        return self.twin if isinstance(self.twin, ParametricTwin) else None
+
+    @property
+    def segmented(self) -> bool:
+        """Whether the commands move and rest, so that each segment has a delay and an offset."""
+        segments = Segments.from_commands(self.records.commands).until(self.records.lengths)
+        return bool(moves_and_rests(segments))
+
+    @cached_property
+    def updated(self) -> Updated | None:
+        """The twin with its parameters identified; None where it has none."""
+        if self.free is None:
+            return None
+        return identify(self.free, self.records, LeastSquares(starts=1), seed=self.seed)
+
+    @property
+    def identified(self) -> Twin:
+        """The same as a twin, or the twin as it is."""
+        return self.twin if self.updated is None else self.updated.twin
+
+    @cached_property
+    def learned(self) -> FittedDynamics:
+        """Corrected state equations, and what they learned."""
+        return fit_dynamics(self.identified, self.records, self.settings.dynamics)  # type: ignore[arg-type]
+
+    @property
+    def dynamics(self) -> DynamicsTwin:
+        """Corrected state equations."""
+        return replace(self.learned.twin, case=self.case)
+
+    def none(self) -> CorrectedTwin:
+        """The twin as it is, with its errors as noise."""
+        return self._noisy(self.twin)
+
+    def parameters(self) -> CorrectedTwin:
+        """The twin with identified parameters, with its errors as noise."""
+        return self._noisy(self.identified)
+
+    def per_sample(self, twin: Twin) -> CorrectedTwin:
+        """A twin whose outputs are corrected at every sample."""
+        return self._corrected(twin, Additive(), self.settings.sequence)
+
+    def per_segment(self, correction: Correction) -> CorrectedTwin:
+        """The twin with a correction that has one z per segment."""
+        return self._corrected(self.identified, correction, self.settings.density)
+
+    def _noisy(self, twin: Twin) -> CorrectedTwin:
+        return self._corrected(twin, Additive(), StationaryNoise())
+
+    def _corrected(self, twin: Twin, correction: Correction, density: object) -> CorrectedTwin:
+        residual = fit_residual(
+            twin,
+            self.records,
+            correction,
+            density,  # type: ignore[call-overload]
+            seed=self.seed,
+            twin=self.original,
+        )
+        return CorrectedTwin(twin, residual, self.case)  # type: ignore[arg-type]

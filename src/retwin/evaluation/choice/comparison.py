@@ -1,0 +1,186 @@
+"""Scores of candidates on the parts that each did not see, and the simplest of the best ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.trajectories import Trajectories
+from retwin.evaluation.choice.folds import Fold, block_length, block_means
+from retwin.scores.distributions import crps_normal
+from retwin.update.forecast_errors import LEVEL, USUAL
+from retwin.update.forecasts import forecasts, free_moments
+
+LARGE = 1e6
+"""Error, in standard deviations of an output, from which on a simulation has diverged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """Predictions of the records of which a fold leaves something out.
+
+    Attributes
+    ----------
+    mean, deviation : NDArray
+        (r, T, d_y).
+    last : NDArray
+        (r, T, d_y), see `Forecasts`; 0 in free simulation.
+
+    """
+
+    mean: NDArray
+    deviation: NDArray
+    last: NDArray
+
+
+def predict(model: object, records: Trajectories, fold: Fold, horizon: float | None) -> Predicted:
+    """Predictions of a fold by a model that was not fitted to it, free or `horizon` s ahead."""
+    own = records[fold.rows]
+    mean, deviation = free_moments(model, own.commands)  # type: ignore[arg-type]
+    if horizon is None:
+        return Predicted(mean, deviation, np.zeros_like(mean))
+    lead = max(1, round(horizon * records.rate))
+    made = forecasts(model, own, [lead])  # type: ignore[arg-type]
+    return Predicted(made.mean[0], np.ones_like(mean), made.last[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The predictions of some models on the same folds.
+
+    Attributes
+    ----------
+    records : Trajectories
+        The records.
+    folds : sequence of Fold
+        What was left out in turn.
+    predicted : mapping of str to sequence of Predicted
+        By model, one for each fold; the simplest model first.
+
+    """
+
+    records: Trajectories
+    folds: Sequence[Fold]
+    predicted: Mapping[str, Sequence[Predicted]]
+
+    @cached_property
+    def spread(self) -> NDArray:
+        """Standard deviations (d_y,) of the outputs."""
+        values = np.where(self.records.mask, self.records.observed, np.nan).astype(np.float64)
+        found = np.nanstd(values, axis=(0, 1))
+        return np.where(found > 0, found, 1.0)
+
+    def errors(self, name: str, i: int) -> NDArray:
+        """Errors (r, T, d_y) in a fold of what it leaves out; NaN elsewhere.
+
+        The share of the last error that is added is that of the other folds.
+        """
+        made = self.predicted[name][i]
+        return self._raw(name, i) - self._persistence(name, i) * made.last
+
+    def _raw(self, name: str, i: int) -> NDArray:
+        fold = self.folds[i]
+        own = self.records[fold.rows]
+        seen = own.mask & fold.held[fold.rows][..., None]
+        return np.where(seen, own.observed - self.predicted[name][i].mean, np.nan)
+
+    def _others(self, i: int) -> list[int]:
+        return [j for j, fold in enumerate(self.folds) if j != i and not fold.edge]
+
+    def _persistence(self, name: str, i: int) -> NDArray:
+        products, powers = np.zeros(len(self.spread)), np.zeros(len(self.spread))
+        for j in self._others(i):
+            raw, last = self._raw(name, j), self.predicted[name][j].last
+            last = np.where(np.isfinite(raw), last, np.nan)
+            products += np.nansum(raw * last, axis=(0, 1))
+            powers += np.nansum(last**2, axis=(0, 1))
+        return np.clip(products / np.maximum(powers, 1e-300), 0.0, 1.0)
+
+    def deviation(self, name: str, i: int) -> NDArray:
+        """Deviations (r, T, d_y) of a fold, scaled to hold what the other folds show."""
+        own = self.predicted[name][i].deviation
+        return np.maximum(own, 1e-9 * self.spread) * self._factor(name, i)
+
+    def _factor(self, name: str, i: int) -> NDArray:
+        ratios = []
+        for j in self._others(i):
+            width = np.maximum(self.predicted[name][j].deviation, 1e-9 * self.spread)
+            ratios.append((np.abs(self.errors(name, j)) / width).reshape(-1, len(self.spread)))
+        return np.nanquantile(np.concatenate(ratios), LEVEL, axis=0) / USUAL
+
+    def diverged(self, name: str) -> bool:
+        """Whether a simulation left any reasonable range."""
+        return any(
+            not np.nanmax(np.abs(self.errors(name, i)) / self.spread, initial=0.0) < LARGE
+            for i in range(len(self.folds))
+        )
+
+    def scores(self, name: str, i: int) -> NDArray:
+        """CRPS (r, T) of a fold in standard deviations of the outputs, averaged over these."""
+        error = self.errors(name, i)
+        each = crps_normal(error, np.zeros_like(error), self.deviation(name, i)) / self.spread
+        seen = np.isfinite(each)
+        count = seen.sum(axis=2)
+        total = np.where(seen, each, 0.0).sum(axis=2)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    def block_scores(self, name: str) -> NDArray:
+        """Mean scores (B,) of nearly independent blocks, which are the same for all models."""
+        made = []
+        for i in range(len(self.folds)):
+            values = self.scores(name, i)
+            made.append(block_means(values, self._lengths[i]))
+        return np.concatenate(made)
+
+    @cached_property
+    def _lengths(self) -> list[int]:
+        first = next(iter(self.predicted))
+        lengths = []
+        for i in range(len(self.folds)):
+            values = self.scores(first, i)
+            lengths.append(block_length(np.nan_to_num(values), np.isfinite(values)))
+        return lengths
+
+    def rmse(self, name: str) -> NDArray:
+        """Root mean square errors (d_y,) of the parts that were left out."""
+        squares = [self.errors(name, i).reshape(-1, len(self.spread)) ** 2 for i in self._all]
+        return np.asarray(np.sqrt(np.nanmean(np.concatenate(squares), axis=0)))
+
+    def coverage(self, name: str) -> NDArray:
+        """Share (d_y,) of the samples inside 90 % bands that the other folds calibrate."""
+        hits = []
+        for i in self._all:
+            error = self.errors(name, i)
+            inside = np.abs(error) <= USUAL * self.deviation(name, i)
+            hits.append(np.where(np.isfinite(error), inside, np.nan).reshape(-1, len(self.spread)))
+        return np.asarray(np.nanmean(np.concatenate(hits), axis=0))
+
+    @property
+    def _all(self) -> range:
+        return range(len(self.folds))
+
+    def simplest(self) -> tuple[str, dict[str, tuple[float, float]]]:
+        """The simplest model within one standard error of the best one (Breiman et al., 1984).
+
+        Returns
+        -------
+        chosen : str
+            Its name.
+        differences : dict of str to (float, float)
+            Of each model, the mean difference of its scores from the best one's, and the standard
+            error of that.
+
+        """
+        scores = {name: self.block_scores(name) for name in self.predicted}
+        best = min(scores, key=lambda name: float(scores[name].mean()))
+        differences = {}
+        for name, own in scores.items():
+            change = own - scores[best]
+            error = change.std(ddof=1) / np.sqrt(len(change)) if len(change) > 1 else 0.0
+            differences[name] = float(change.mean()), float(error)
+        chosen = next(name for name, (mean, error) in differences.items() if mean <= error)
+        return chosen, differences

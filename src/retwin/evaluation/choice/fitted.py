@@ -1,0 +1,162 @@
+"""`Fitted`: the twin that was chosen, and all that it was chosen from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.trajectories import Trajectories
+from retwin.serialisation.files import read_json, write_json
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.dynamics import DynamicsTwin, FittedDynamics
+
+FILE = "choice.json"
+"""The comparison, in the folder of the model."""
+
+
+@dataclass(frozen=True)
+class CandidateScore:
+    """How a candidate predicts what was left out of its fits.
+
+    Attributes
+    ----------
+    name, title : str
+        Key and words.
+    rmse : dict of str to float
+        By output, in its unit; empty where the candidate failed.
+    nrmse : float
+        The same over the outputs' standard deviations, averaged.
+    crps : float
+        In standard deviations of the outputs, averaged over blocks.
+    difference, standard_error : float
+        Of `crps` from that of the best candidate, over blocks.
+    coverage : float
+        Share of samples inside 90 % bands that other parts calibrated.
+    seconds : float
+        Processor time of all fits.
+    reason : str
+        Why it has no score; "" if it has.
+    uses_twin : bool
+        False for a model that knows nothing of the twin.
+
+    """
+
+    name: str
+    title: str
+    rmse: dict[str, float]
+    nrmse: float
+    crps: float
+    difference: float
+    standard_error: float
+    coverage: float
+    seconds: float
+    reason: str = ""
+    uses_twin: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """An updated twin, with the comparison by which it was chosen.
+
+    Attributes
+    ----------
+    twin : CorrectedTwin or DynamicsTwin
+        The model, fitted to all records, its bands calibrated by the parts that were left out.
+    chosen, preferred : str
+        The candidate that `twin` is, and the one that the comparison shows; they differ where a
+        method was given.
+    scores : tuple of CandidateScore
+        All candidates, the simplest first, and then the models without the twin.
+    remarks : tuple of str
+        What the comparison shows of twin and records, in sentences.
+    parameters : mapping of str to (float, float, float)
+        By parameter: before the fit, identified alone, and in `twin`.
+    horizon : float or None
+        Time ahead in s at which candidates were judged; None for free simulation.
+    parts : tuple of str
+        What was left out in turn.
+    measured, predicted, deviation : NDArray
+        (n, T, d_y): the records, and the chosen candidate's predictions of the parts in time that
+        were left out; NaN elsewhere.
+    learned : FittedDynamics or None
+        What corrected state equations learned; None where the twin has none.
+    seconds : float
+        Duration.
+
+    """
+
+    twin: CorrectedTwin | DynamicsTwin
+    chosen: str
+    preferred: str
+    scores: tuple[CandidateScore, ...]
+    remarks: tuple[str, ...]
+    parameters: Mapping[str, tuple[float, float, float]]
+    horizon: float | None
+    parts: tuple[str, ...]
+    records: Trajectories
+    predicted: NDArray
+    deviation: NDArray
+    learned: FittedDynamics | None
+    seconds: float
+
+    def score(self, name: str) -> CandidateScore:
+        """The score of a candidate."""
+        return next(each for each in self.scores if each.name == name)
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The comparison as JSON values."""
+        scores = [
+            {key: _finite(value) for key, value in asdict(each).items()} for each in self.scores
+        ]
+        return {
+            "chosen": self.chosen,
+            "preferred": self.preferred,
+            "horizon": self.horizon,
+            "parts": list(self.parts),
+            "candidates": scores,
+            "remarks": list(self.remarks),
+            "parameters": {name: list(each) for name, each in self.parameters.items()},
+            "seconds": self.seconds,
+            "dynamics": self._learned,
+            "residual": self._residual,
+        }
+
+    @property
+    def _learned(self) -> dict[str, Any] | None:
+        found = self.learned
+        if found is None:
+            return None
+        correlations = [[*pair, each] for pair, each in found.correlations.items()]
+        errors = {name: _finite(each) for name, each in found.errors.items()}
+        names = ("parameters", "terms", "figures", "reason")
+        own = {name: getattr(found, name) for name in names}
+        return own | {"errors": errors, "correlations": correlations}
+
+    @property
+    def _residual(self) -> dict[str, Any] | None:
+        if not isinstance(self.twin, CorrectedTwin) or self.twin.residual.fitted is None:
+            return None
+        fitted = self.twin.residual.fitted
+        return {"figures": fitted.figures, "reason": fitted.reason}
+
+    def save(self, folder: str | Path) -> None:
+        """Write the twin as `rt.load_twin` reads it, with the comparison beside it."""
+        self.twin.save(folder)
+        write_json(Path(folder) / FILE, self.values)
+
+
+def _finite(value: Any) -> Any:
+    """A value for JSON, which has neither NaN nor infinity."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def read_choice(folder: str | Path) -> dict[str, Any] | None:
+    """The comparison in the folder of a model; None where there is none."""
+    file = Path(folder) / FILE
+    return read_json(file) if file.is_file() else None

@@ -1,0 +1,388 @@
+"""`fit`: an updated twin, its correction chosen by parts of the records that are left out."""
+
+from __future__ import annotations
+
+import copy
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from retwin.catalog import CANDIDATES
+from retwin.checks import require
+from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.errors import InputError
+from retwin.evaluation.choice.candidates import Candidates, Model
+from retwin.evaluation.choice.comparison import Comparison, Predicted, predict
+from retwin.evaluation.choice.fitted import CandidateScore, Fitted
+from retwin.evaluation.choice.folds import Fold, folds_of
+from retwin.evaluation.choice.remarks import remarks_of, without_twin
+from retwin.evaluation.choice.settings import Choice
+from retwin.progress import Progress
+from retwin.threads import one_thread
+from retwin.twins.collected import SimulationError
+from retwin.twins.parametric import ParametricTwin
+from retwin.twins.twin import Twin, check_channels
+from retwin.update.blackbox import BLACK_BOXES, fit_black_box
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.corrections import Additive
+from retwin.update.dynamics import DynamicsTwin
+from retwin.update.dynamics.unknowns import state_names, state_twin_of
+from retwin.update.forecast_errors import ForecastErrors
+from retwin.update.forecasts import LEADS, calibrate_forecasts, forecasts, free_moments
+
+BASELINES = ("none", "parameters")
+"""Candidates that correct nothing."""
+
+
+def fit(
+    twin: Twin,
+    records: Trajectories,
+    settings: Choice = Choice(),  # noqa: B008 - frozen
+    *,
+    seed: int = 0,
+    case: str = "",
+    original: Twin | None = None,
+    progress: Progress | None = None,
+) -> Fitted:
+    """Update a twin by the correction that predicts left-out parts of its records best.
+
+    Candidates are the twin as it is, with identified parameters, with corrected state equations,
+    with a delay and an offset per segment, with a residual of each output sample, and the last two
+    in series, as far as the twin and the records allow. Each is fitted without each part of the
+    records in turn, and predicts it. The simplest is taken whose score (CRPS) is within one
+    standard error of the best one, and fitted to all records; its bands are calibrated by its
+    errors on the parts that were left out.
+
+    Parameters
+    ----------
+    twin : Twin
+        Any twin; a `StateTwin`, or a `ParametricTwin` of one, also has corrected state equations.
+    records : Trajectories
+        Measured outputs with commands. Of labelled records the healthy ones are used.
+    settings : Choice
+        The candidates, and the horizon at which they are judged.
+    seed : int
+        Of networks and searches; the same seed gives the same bytes on the same machine.
+    case : str
+        Name of the case of the twin, which the saved model names.
+    original : Twin, optional
+        The twin that a surrogate `twin` was trained on, by which its error is measured.
+    progress : callable, optional
+        Called with the share of the work that is done.
+
+    Returns
+    -------
+    Fitted
+        Its `twin` is the updated twin.
+
+    Raises
+    ------
+    InputError
+        Other channels or another rate than those of the twin, no healthy record, too few samples,
+        or no candidate that can be fitted.
+
+    """
+    with one_thread():  # fits are small, and threads that wait for each other take longer
+        return _fit(twin, _healthy(records), settings, seed, case, original, progress)
+
+
+def _fit(
+    twin: Twin,
+    records: Trajectories,
+    settings: Choice,
+    seed: int,
+    case: str,
+    original: Twin | None,
+    progress: Progress | None,
+) -> Fitted:
+    began = time.perf_counter()
+    check_channels(twin, records, "records")
+    whole = Candidates(twin, records, settings, seed, case, original)
+    names = _names(whole, settings)
+    folds = folds_of(records)
+    trials = Trials(whole, folds, names, progress or (lambda _: None))
+    trials.run()
+    comparison = trials.comparison
+    preferred, differences = comparison.simplest()
+    chosen = settings.method or preferred
+    model = trials.final(chosen)
+    model = _calibrated(model, trials, chosen)
+    scores = _scores(trials, comparison, differences)
+    predicted, deviation = _shown(comparison, chosen)
+    found = Fitted(
+        twin=model,
+        chosen=chosen,
+        preferred=preferred,
+        scores=scores,
+        remarks=remarks_of(twin, records, comparison, scores, chosen, preferred, settings.horizon),
+        parameters=_parameters(whole, model),
+        horizon=settings.horizon,
+        parts=tuple(each.name for each in folds),
+        records=records,
+        predicted=predicted,
+        deviation=deviation,
+        learned=whole.learned if "learned" in vars(whole) else None,
+        seconds=time.perf_counter() - began,
+    )
+    return with_yardstick(found, seed=seed) if settings.yardstick else found
+
+
+def _healthy(records: Trajectories) -> Trajectories:
+    """The healthy records; unlabelled ones are healthy where none has a label."""
+    if not records.known_labels:
+        return records.replace(labels=[HEALTHY] * len(records))
+    require(
+        HEALTHY in records.known_labels,
+        "records",
+        expected=f"at least one record labelled {HEALTHY!r}, or none with a label",
+        got=f"labels {sorted(records.known_labels)}",
+        remedy="label healthy records",
+    )
+    return records.with_label(HEALTHY)
+
+
+def _names(candidates: Candidates, settings: Choice) -> list[str]:
+    """The candidates that are compared."""
+    names = list(candidates.fits)
+    require(
+        names and (not settings.method or settings.method in names),
+        "method",
+        expected=f"a candidate that this twin and these records allow: {', '.join(names)}",
+        got=settings.method or "none",
+        remedy="dynamics need a StateTwin, or a state surrogate of the twin; a delay and an offset "
+        "commands that move and rest",
+    )
+    return names
+
+
+@dataclass(eq=False)
+class Trials:
+    """The fits of all candidates without each fold, and what they predict."""
+
+    whole: Candidates
+    folds: Sequence[Fold]
+    names: Sequence[str]
+    progress: Progress
+    models: dict[str, list[Model]] = field(default_factory=dict)
+    predicted: dict[str, list[Predicted]] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def run(self) -> None:
+        """Fit and predict all."""
+        total, done = len(self.names) * len(self.folds) + len(self.names), 0
+        for fold in self.folds:
+            training = fold.training(self.whole.records)
+            own = replace(self.whole, records=training, settings=self.whole.settings.lighter)
+            fits = own.fits
+            for name in self.names:
+                if name not in self.reasons:
+                    self._try(name, fits.get(name), fold)
+                done += 1
+                self.progress(done / total)
+        require(
+            len(self.reasons) < len(self.names),
+            "records",
+            expected="records to which a candidate can be fitted without a part of them",
+            got="; ".join(f"{name}: {reason}" for name, reason in self.reasons.items()),
+            remedy="give longer or more records",
+        )
+
+    def _try(self, name: str, fit: Callable[[], Model] | None, fold: Fold) -> None:
+        began = time.process_time()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the final fit states them
+                if fit is None:
+                    raise InputError("records", expected="such records", got="none", remedy="")
+                model = fit()
+                made = predict(model, self.whole.records, fold, self.whole.settings.horizon)
+        except (InputError, SimulationError) as error:
+            self.reasons[name] = str(error)
+            return
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.process_time() - began
+        if not np.isfinite(made.mean[np.isfinite(made.last)]).all():
+            self.reasons[name] = "its simulation is not finite"
+            return
+        self.models.setdefault(name, []).append(model)
+        self.predicted.setdefault(name, []).append(made)
+
+    @property
+    def comparison(self) -> Comparison:
+        """Of the candidates that could be fitted without any fold."""
+        kept = {name: made for name, made in self.predicted.items() if name not in self.reasons}
+        found = Comparison(self.whole.records, self.folds, kept)
+        for name in kept:
+            if found.diverged(name):
+                self.reasons[name] = "its simulation diverges"
+        good = {name: made for name, made in kept.items() if name not in self.reasons}
+        require(
+            good,
+            "twin",
+            expected="simulations that stay finite",
+            got="; ".join(self.reasons.values()),
+            remedy="identify the twin first, or judge it over a horizon",
+        )
+        return Comparison(self.whole.records, self.folds, good)
+
+    def final(self, name: str) -> Model:
+        """The candidate, fitted to all records."""
+        return self.whole.fits[name]()
+
+
+def _calibrated(model: Model, trials: Trials, name: str) -> Model:
+    """The model with bands that hold what the parts in time show."""
+    records, found = trials.whole.records, []
+    if name in trials.reasons:
+        return model
+    leads = [each for each in LEADS if 4 * each <= records.steps]
+    for one, fold in zip(trials.models[name], trials.folds, strict=True):
+        if not fold.edge:
+            own = records[fold.rows]
+            free = free_moments(one, own.commands)[0]
+            found.append((forecasts(one, own, leads), free, own, fold.held[fold.rows]))
+    forecast = calibrate_forecasts(found, leads)
+    deviation = np.where(records.mask, free_moments(model, records.commands)[1], np.nan)
+    with np.errstate(invalid="ignore"):
+        size = np.sqrt(np.nanmean(deviation**2, axis=(0, 1)))
+    factors = np.divide(forecast.deviation[-1], size, out=np.ones_like(size), where=size > 0)
+    return widened(model, factors, forecast)
+
+
+def widened(model: Model, factors: NDArray, forecast: ForecastErrors) -> Model:
+    """The model with deviations of each output multiplied by a factor (d_y,)."""
+    if isinstance(model, DynamicsTwin):
+        return replace(model, widening=model.widening * factors, forecast=forecast)
+    if isinstance(model.residual.correction, Additive):
+        residual = copy.deepcopy(model.residual)
+        with torch.no_grad():
+            residual.spread = residual.spread * torch.as_tensor(factors).to(residual.spread)
+        return replace(model, residual=residual, forecast=forecast)
+    return replace(model, forecast=forecast)
+
+
+def with_yardstick(found: Fitted, *, seed: int = 0, progress: Progress | None = None) -> Fitted:
+    """The same, compared with models without the twin on the same parts.
+
+    Parameters
+    ----------
+    found : Fitted
+        What `fit` returned.
+    seed : int
+        Of networks.
+    progress : callable, optional
+        Called with the share of the work that is done.
+
+    """
+    began, records, report = time.perf_counter(), found.records, progress or (lambda _: None)
+    folds = folds_of(records)
+    predicted: dict[str, list[Predicted]] = {}
+    seconds, reasons = dict.fromkeys(BLACK_BOXES, 0.0), {}
+    for i, kind in enumerate(BLACK_BOXES):
+        since = time.process_time()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                predicted[kind] = []
+                for j, fold in enumerate(folds):
+                    model = fit_black_box(fold.training(records), kind, seed=seed).twin
+                    predicted[kind].append(predict(model, records, fold, found.horizon))
+                    report((i + (j + 1) / len(folds)) / len(BLACK_BOXES))
+        except (InputError, SimulationError) as error:
+            reasons[kind] = str(error)
+            del predicted[kind]
+        seconds[kind] = time.process_time() - since
+    comparison = Comparison(records, folds, predicted)
+    rows = []
+    for kind in BLACK_BOXES:
+        if kind in predicted and comparison.diverged(kind):
+            reasons[kind] = "its simulation diverges"
+        nothing = {kind: (float("nan"), float("nan"))}
+        row = _row(kind, comparison, nothing, seconds[kind], reasons.get(kind, ""))
+        rows.append(replace(row, uses_twin=False))
+    own = [each for each in found.scores if each.uses_twin]
+    return replace(
+        found,
+        scores=(*own, *rows),
+        remarks=(*found.remarks, *without_twin(rows, found.score(found.chosen))),
+        seconds=found.seconds + time.perf_counter() - began,
+    )
+
+
+def _scores(
+    trials: Trials,
+    comparison: Comparison,
+    differences: dict[str, tuple[float, float]],
+) -> tuple[CandidateScore, ...]:
+    """The rows of the table."""
+    return tuple(
+        _row(name, comparison, differences, trials.seconds[name], trials.reasons.get(name, ""))
+        for name in trials.names
+    )
+
+
+def _row(
+    name: str,
+    comparison: Comparison,
+    differences: dict[str, tuple[float, float]],
+    seconds: float,
+    reason: str,
+) -> CandidateScore:
+    title = CANDIDATES.get(name, name)
+    if reason or name not in comparison.predicted:
+        n = float("nan")
+        return CandidateScore(name, title, {}, n, n, n, n, n, seconds, reason)
+    rmse = comparison.rmse(name)
+    names = comparison.records.outputs.names
+    return CandidateScore(
+        name,
+        title,
+        dict(zip(names, rmse.tolist(), strict=True)),
+        float(np.mean(rmse / comparison.spread)),
+        float(comparison.block_scores(name).mean()),
+        *differences[name],
+        float(np.mean(comparison.coverage(name))),
+        seconds,
+    )
+
+
+def _shown(comparison: Comparison, name: str) -> tuple[NDArray, NDArray]:
+    """Predictions (n, T, d_y) of the parts in time that were left out, and their deviations."""
+    shape = comparison.records.observed.shape
+    mean, deviation = np.full(shape, np.nan), np.full(shape, np.nan)
+    if name not in comparison.predicted:
+        return mean, deviation
+    measured = comparison.records.observed
+    for i, fold in enumerate(comparison.folds):
+        if not fold.edge:
+            rows, held = fold.rows, fold.held[fold.rows][..., None]
+            made = measured[rows] - comparison.errors(name, i)
+            mean[rows] = np.where(held, made, mean[rows])
+            deviation[rows] = np.where(held, comparison.deviation(name, i), deviation[rows])
+    return mean, deviation
+
+
+def _parameters(whole: Candidates, model: Model) -> dict[str, tuple[float, float, float]]:
+    """By parameter: before, identified alone, and in the model."""
+    free = whole.free
+    if free is None:
+        return {}
+    before = dict(zip(free.names, free.values, strict=True))
+    alone = dict(whole.updated.values) if "updated" in vars(whole) and whole.updated else before
+    inside: object = model
+    if isinstance(model, CorrectedTwin):
+        inside = getattr(model.surrogate, "twin", model.surrogate)
+    now = before
+    if isinstance(inside, DynamicsTwin):
+        now = dict(zip(inside.equations.names, inside.values.tolist(), strict=True))
+    elif state_names(inside):
+        now = state_twin_of(inside)[2]  # type: ignore[arg-type]
+    elif isinstance(inside, ParametricTwin):
+        now = dict(zip(inside.names, inside.values, strict=True))
+    return {name: (before[name], alone[name], now.get(name, alone[name])) for name in before}

@@ -1,0 +1,132 @@
+"""What a comparison of candidates shows of a twin and its records, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.trajectories import Trajectories
+from retwin.evaluation.choice.comparison import Comparison
+from retwin.evaluation.choice.fitted import CandidateScore
+from retwin.twins.twin import Twin
+
+EXPLAINED = 0.2
+"""Share of the mean square error of the twin from which on a dead time is mentioned."""
+LONGEST = 0.1
+"""Longest dead time that is tried, over the length of a record."""
+BETTER = 0.1
+"""Share by which a model without the twin must be better to be mentioned."""
+
+
+def remarks_of(
+    twin: Twin,
+    records: Trajectories,
+    comparison: Comparison,
+    scores: Sequence[CandidateScore],
+    chosen: str,
+    preferred: str,
+    horizon: float | None,
+) -> tuple[str, ...]:
+    """The sentences, the most important one first."""
+    by_name = {each.name: each for each in scores}
+    made = []
+    if chosen != preferred:
+        made.append(
+            f"The method was given ({by_name[chosen].title}); the comparison would have taken: "
+            f"{by_name[preferred].title}."
+        )
+    made += _worse_than_mean(records, by_name[chosen])
+    if preferred in ("none", "parameters"):
+        more = " with its identified parameters" if preferred == "parameters" else ""
+        made.append(
+            f"Nothing to correct: no correction predicts parts of the records that were left out "
+            f"better than the twin{more}."
+        )
+    baseline = "parameters" if "parameters" in comparison.predicted else "none"
+    if baseline in comparison.predicted and horizon is None:
+        made += _of_twin(records, comparison, baseline)
+    return tuple(made)
+
+
+def _worse_than_mean(records: Trajectories, score: CandidateScore) -> list[str]:
+    values = np.where(records.mask, records.observed, np.nan).astype(np.float64)
+    spread = dict(zip(records.outputs.names, np.nanstd(values, axis=(0, 1)), strict=True))
+    return [
+        f"{name} is predicted worse than by its mean over the records: the error is {error:.3g}, "
+        f"the standard deviation {spread[name]:.3g}. Do not use this model for {name}."
+        for name, error in score.rmse.items()
+        if error >= spread[name]
+    ]
+
+
+def _of_twin(records: Trajectories, comparison: Comparison, name: str) -> list[str]:
+    """A wrong sign and a missing dead time of the twin, by its own simulations."""
+    made, shape = [], records.observed.shape
+    nominal = np.full(shape, np.nan)
+    for i, fold in enumerate(comparison.folds):
+        if not fold.edge:
+            held = fold.held[fold.rows][..., None]
+            own = np.where(held, comparison.predicted[name][i].mean, np.nan)
+            nominal[fold.rows] = np.where(held, own, nominal[fold.rows])
+    for channel, output in enumerate(records.outputs.names):
+        y = np.where(records.mask[..., channel], records.observed[..., channel], np.nan)
+        y, x = y.astype(np.float64), nominal[..., channel]
+        both = np.isfinite(y) & np.isfinite(x)
+        if both.sum() < 2 or np.std(x[both]) == 0:
+            continue
+        slope = np.corrcoef(x[both], y[both])[0, 1]
+        if slope < -0.5:
+            made.append(
+                f"The twin moves {output} in the opposite direction (correlation {slope:.2f}): "
+                "check the sign of the gain."
+            )
+            continue
+        delay, share = _dead_time(y, x)
+        if share >= EXPLAINED and abs(delay) >= 0.5:
+            seconds = delay / records.rate
+            what = f"A dead time of {seconds:.3g} s" if delay > 0 else "A delay that is shorter"
+            more = "" if delay > 0 else f" by {-seconds:.3g} s"
+            made.append(
+                f"{what}{more} explains {share:.0%} of the mean square error of the twin in "
+                f"{output}."
+            )
+    return made
+
+
+def _dead_time(y: NDArray, x: NDArray) -> tuple[float, float]:
+    """The shift of a simulation x (n, T) in samples that explains most of y, and what share."""
+    longest = max(1, int(LONGEST * y.shape[1]))
+    shifts = np.arange(-longest, longest + 1)
+    errors = []
+    for shift in shifts:
+        moved = np.full_like(x, np.nan)
+        if shift > 0:
+            moved[:, shift:] = x[:, :-shift]
+        else:
+            moved[:, : x.shape[1] + shift] = x[:, -shift:]
+        errors.append(np.nanmean((y - moved) ** 2))
+    best = int(np.argmin(errors))
+    delay = float(shifts[best])
+    if 0 < best < len(shifts) - 1:
+        before, here, after = errors[best - 1 : best + 2]
+        curvature = before - 2 * here + after
+        delay += 0.5 * (before - after) / curvature if curvature > 0 else 0.0
+    present = errors[longest]
+    return delay, float(1 - errors[best] / present) if present > 0 else 0.0
+
+
+def without_twin(scores: Sequence[CandidateScore], chosen: CandidateScore) -> list[str]:
+    """A model without the twin that is better than the chosen candidate, in a sentence."""
+    rivals = [each for each in scores if each.rmse]
+    if not rivals:
+        return []
+    best = min(rivals, key=lambda each: each.nrmse)
+    gain = 1 - best.nrmse / chosen.nrmse
+    if gain < BETTER:
+        return []
+    return [
+        f"The {best.title} predicts the same parts better by {gain:.0%}: the twin lacks something "
+        "that the commands determine."
+    ]

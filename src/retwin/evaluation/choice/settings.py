@@ -1,0 +1,69 @@
+"""`Choice`: which candidates are compared, and at which horizon."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from retwin.catalog import CANDIDATES
+from retwin.checks import one_of, positive
+from retwin.update.corrections import Correction
+from retwin.update.dynamics import Dynamics
+from retwin.update.residual import Density, Mixture, SequenceMixture
+
+MEMBERS = 2
+"""Members of a network that is fitted without a part of the records: more lower its error a little,
+and take as many times as long."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Settings of the comparison of candidates.
+
+    Parameters
+    ----------
+    candidates : sequence of str
+        Keys of `retwin.catalog.CANDIDATES` that are compared, the simplest first; by default all
+        that the twin and the records allow.
+    method : str
+        The candidate that is taken whatever the comparison shows; by default the one that it shows.
+    horizon : float, optional
+        Time in s over which predictions from measurements are judged; by default free simulation
+        from the commands alone.
+    dynamics : Dynamics
+        The form of a discrepancy inside state equations.
+    correction : Correction, optional
+        A correction with one z per segment, in place of a delay and an offset.
+    density, sequence : Density and SequenceMixture
+        The distributions of z, one per segment and one per sample.
+    yardstick : bool
+        Whether models without the twin are fitted as well, to be compared with.
+
+    Raises
+    ------
+    InputError
+        An unknown candidate, or a horizon that is not positive.
+
+    """
+
+    candidates: Sequence[str] = ()
+    method: str = ""
+    horizon: float | None = None
+    dynamics: Dynamics = Dynamics()  # noqa: RUF009 - frozen
+    correction: Correction | None = None
+    density: Density = Mixture()  # noqa: RUF009 - frozen
+    sequence: SequenceMixture = SequenceMixture()  # noqa: RUF009 - frozen
+    yardstick: bool = False
+
+    @property
+    def lighter(self) -> Choice:
+        """The same with networks of fewer members, for fits whose means alone are compared."""
+        members = min(self.sequence.members, MEMBERS)
+        return replace(self, sequence=replace(self.sequence, members=members, refit=False))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "candidates", tuple(self.candidates))
+        for name in (*self.candidates, *filter(None, [self.method])):
+            one_of("candidates", name, CANDIDATES)
+        if self.horizon is not None:
+            positive("horizon", self.horizon)

@@ -1,0 +1,228 @@
+"""`stand_in`: a surrogate for a slow twin, checked against the twin; else the twin itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from retwin.catalog import SURROGATE_MODES
+from retwin.checks import one_of
+from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.errors import InputError
+from retwin.nets.networks import LSTM, MLP, Network, StateSpace
+from retwin.nets.training import Training
+from retwin.progress import Progress
+from retwin.twins.collected import SimulationError
+from retwin.twins.command_range import CommandRange
+from retwin.twins.faults import Fault
+from retwin.twins.record_sampler import sampler_from
+from retwin.twins.samplers import CommandSampler, RecordedSampler
+from retwin.twins.twin import Twin
+from retwin.update.corrected import generate
+from retwin.update.surrogate import Surrogate, fit_surrogate
+
+SLOW = 0.03
+"""Duration in s of a simulation of one record from which on a surrogate pays: ten thousand of them
+take as long as its training, some minutes."""
+SMALL = 0.5
+"""Largest error of a surrogate on the commands of the records, over the discrepancy of the twin
+there, both root mean squares: of their sum it is then a tenth."""
+OTHERS: tuple[Network, ...] = (StateSpace(), LSTM(64))
+"""Networks that are tried where the first one does not follow the twin: slow and integrating twins
+need states, others a long memory."""
+
+
+@dataclass(frozen=True)
+class Simulating:
+    """How the simulations for a surrogate are made, and how it is trained.
+
+    Parameters
+    ----------
+    mode : {"auto", "on", "off"}
+        Whether a surrogate stands in for the twin: if the twin is slow, always, or never.
+    sampler : CommandSampler, optional
+        The distribution of commands; by default like those of the records.
+    simulations : int
+        Number of simulations.
+    recorded : Trajectories, optional
+        Simulations of the twin that are there already.
+    network : Network
+        The network that is tried first.
+    training : Training, optional
+        Its training; by default that of the network.
+    strict : bool
+        Whether only that network is tried.
+
+    """
+
+    mode: str = "auto"
+    sampler: CommandSampler | None = None
+    simulations: int = 400
+    recorded: Trajectories | None = None
+    network: Network = MLP()  # noqa: RUF009 - frozen
+    training: Training | None = None
+    strict: bool = False
+
+    def __post_init__(self) -> None:
+        one_of("surrogate", self.mode, SURROGATE_MODES)
+
+
+def stand_in(
+    twin: Twin,
+    records: Trajectories,
+    settings: Simulating = Simulating(),
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[Twin, str]:
+    """The twin that corrections are fitted to: the twin itself, or a surrogate of it.
+
+    Parameters
+    ----------
+    twin : Twin
+        Any twin.
+    records : Trajectories
+        Measured outputs with the commands for which the surrogate must follow the twin.
+    settings : Simulating
+        Whether there is a surrogate, and how it is trained.
+    seed : int
+        Of commands and weights.
+    progress : callable, optional
+        Called with the share that is done.
+
+    Returns
+    -------
+    Twin, str
+        The twin or a `Surrogate`, and what was decided, in a sentence.
+
+    Raises
+    ------
+    InputError
+        No network follows the twin on the commands of the records: its error is not small compared
+        with the discrepancy of the twin.
+
+    """
+    if settings.mode == "off" or isinstance(twin, Surrogate):
+        return twin, ""
+    if settings.mode == "auto":
+        begun = time.perf_counter()
+        twin.simulate(records.commands[:1].astype(np.float64), seed=0)
+        taken = time.perf_counter() - begun
+        if taken < SLOW:
+            return twin, ""
+    report = progress or (lambda _: None)
+    made, text = settings.recorded, ""
+    if made is None:
+        made, text = simulations_for(twin, records, settings, seed, lambda s: report(0.5 * s))
+    networks = [settings.network, *([] if settings.strict else OTHERS)]
+    failures = []
+    for i, network in enumerate(networks):
+        training = settings.training if i == 0 else None
+        surrogate = fit_surrogate(
+            made,
+            network,
+            seed=seed,
+            training=training,
+            progress=lambda s, i=i: report(0.5 + 0.5 * (i + s) / len(networks)),  # type: ignore[misc]
+        )
+        failure = _failure(surrogate, twin, records)
+        if not failure:
+            report(1.0)
+            return surrogate, text
+        failures.append(f"{type(network).__name__}: {failure}")
+    raise InputError(
+        "surrogate",
+        expected=f"a surrogate whose error is at most {SMALL:g} times the discrepancy of the twin "
+        "on the commands of the records",
+        got="; ".join(failures),
+        remedy="use the twin itself (--surrogate off), or train on more simulations, for longer, "
+        "or with another network",
+    )
+
+
+def _failure(surrogate: Surrogate, twin: Twin, records: Trajectories) -> str:
+    """The error of a surrogate that is not small compared with the discrepancy; "" if it is."""
+    try:
+        nominal = twin.simulate(records.commands.astype(np.float64), seed=0).nominal
+    except (InputError, SimulationError):  # the surrogate is all there is for these commands
+        return ""
+    error = surrogate.predict(records.commands) - nominal
+    for channel, name in enumerate(records.outputs.names):
+        seen = records.mask[..., channel]
+        if not seen.any():
+            continue
+        sizes = [
+            float(np.sqrt(np.mean(np.square(each[..., channel][seen], dtype=np.float64))))
+            for each in (error, records.observed - nominal)
+        ]
+        if sizes[0] > SMALL * sizes[1]:
+            return f"{sizes[0]:.4g} in {name} where the twin differs by {sizes[1]:.4g}"
+    return ""
+
+
+@dataclass(frozen=True)
+class _Healthy:
+    """A system without faults, from which commands are drawn."""
+
+    sampler: CommandSampler
+    faults: dict[str, Fault | None] = field(default_factory=lambda: {HEALTHY: None})
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        return tuple(self.faults)
+
+
+def simulations_for(
+    twin: Twin,
+    records: Trajectories,
+    settings: Simulating,
+    seed: int,
+    progress: Progress | None = None,
+) -> tuple[Trajectories, str]:
+    """Healthy simulations of a twin, which contain what the commands of the records contain.
+
+    Where the sampler does not draw such commands, half as many are added that are like those of
+    the records, and as many parts of these.
+
+    Returns
+    -------
+    Trajectories, str
+        The simulations, and what was added, in a sentence.
+
+    """
+    real, rate = records.commands, records.rate
+    limits = getattr(twin, "limits", None)
+    similar = sampler_from(real, rate, limits=limits)
+    duration = min(similar.duration, real.shape[1] / rate)
+    parts: Sequence[CommandSampler] = (similar, RecordedSampler(real, rate, duration))
+
+    def drawn(sampler: CommandSampler, count: int) -> Trajectories:
+        system = _Healthy(sampler)
+        return generate(twin, system, per_class=count, seed=seed, progress=progress)
+
+    half = max(1, settings.simulations // 2)
+    if settings.sampler is None:
+        return _together([drawn(each, half) for each in parts]), ""
+    made = drawn(settings.sampler, settings.simulations)
+    outside = CommandRange.of(made.commands, rate).outside(real, rate, twin.inputs)
+    if not outside:
+        return made, ""
+    text = (
+        f"The sampler of the case does not draw the real commands: {outside}. {2 * half} "
+        "simulations of commands like these were added"
+    )
+    return _together([made, *(drawn(each, half) for each in parts)]), text
+
+
+def _together(sets: Sequence[Trajectories]) -> Trajectories:
+    """Several sets as one, all as long as the longest."""
+    steps = max(each.steps for each in sets)
+    return Trajectories.concatenate([each.padded(steps) for each in sets])
+
+
+def needs_gradient(twin: Twin) -> bool:
+    """Whether a correction that takes derivatives by commands needs a surrogate of the twin."""
+    return not (isinstance(twin, Surrogate) or callable(twin))

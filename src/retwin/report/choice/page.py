@@ -1,0 +1,154 @@
+"""`write_page`: one self-contained HTML page about an updated twin."""
+
+from __future__ import annotations
+
+from math import isfinite
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from retwin._version import __version__
+from retwin.evaluation.choice.fitted import Fitted
+from retwin.report.assets import environment, plotly_js, script_json
+from retwin.report.blocks import Cell, Column, Table, columns
+from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
+from retwin.report.identification.figures import OUTPUTS, SAMPLES
+from retwin.report.identification.texts import significant
+from retwin.report.labels import counted, duration
+from retwin.report.plotly_specs import figure_specs
+from retwin.serialisation.files import write_atomically
+from retwin.update.forecast_errors import USUAL
+
+MEASURED, PREDICTED = "ink", "c0"
+
+
+def write_page(found: Fitted, path: Path, *, title: str) -> None:
+    """Write the page, which needs no other file and no network."""
+    templates = environment()
+    templates.filters |= {"counted": counted, "duration": duration}
+    templates.globals |= {
+        "results": SimpleNamespace(emulated=found.records.emulated),
+        "anchors": set(),
+        "images": {},
+    }
+    figures = {"predictions": _predictions(found)}
+    forecast = found.twin.forecast
+    text = templates.get_template("fit.html.j2").render(
+        found=found,
+        title=title,
+        folder=str(path.parent),
+        taken=found.score(found.chosen),
+        parts=", ".join(dict.fromkeys(found.parts)),
+        horizon="in free simulation from the commands"
+        if found.horizon is None
+        else f"{found.horizon:g} s ahead of the last measurement",
+        errors=_errors(found),
+        comparison=_comparison(found),
+        parameters=_parameters(found),
+        bands=_bands(found),
+        promised=forecast is not None and forecast.promised,
+        figures=figures,
+        version=__version__,
+        specs=script_json(figure_specs(figures.values())),
+        plotly=plotly_js(),
+    )
+    with write_atomically(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def _units(found: Fitted) -> dict[str, str]:
+    pairs = zip(found.records.outputs.names, found.records.outputs.units, strict=True)
+    return {name: "" if unit == "1" else f" {unit}" for name, unit in pairs}
+
+
+def _errors(found: Fitted) -> list[str]:
+    """The error of each output, in a sentence."""
+    units, score = _units(found), found.score(found.chosen)
+    return [
+        f"Its RMS error in {name} is {significant(error)}{units[name]}."
+        for name, error in score.rmse.items()
+    ]
+
+
+def _comparison(found: Fitted) -> Table:
+    rows, units = [], _units(found)
+    for head, own in (("with the twin", True), ("without the twin", False)):
+        some = [each for each in found.scores if each.uses_twin is own]
+        if some and not own:
+            rows.append([Cell(head)])
+        for each in some:
+            best = each.name == found.chosen
+            if not each.rmse:
+                rows.append([Cell(each.title, each.reason), *[Cell("–")] * (len(units) + 4)])
+                continue
+            behind = significant(each.difference) if isfinite(each.difference) else "–"
+            error = f"± {significant(each.standard_error)}" if isfinite(each.standard_error) else ""
+            rows.append(
+                [
+                    Cell(each.title, "taken" if best else "", best=best),
+                    *(
+                        Cell(significant(each.rmse[name]) + units[name], best=best)
+                        for name in units
+                    ),
+                    Cell(significant(each.crps), best=best),
+                    Cell(behind, error),
+                    Cell(f"{each.coverage:.0%}"),
+                    Cell(duration(each.seconds)),
+                ]
+            )
+    heads = [
+        Column("candidate", numeric=False),
+        *(Column(name, "RMS error") for name in units),
+        *map(Column, ("CRPS", "behind the best", "90 % bands hold", "time")),
+    ]
+    return Table("Candidates, the simplest first", heads, rows)
+
+
+def _parameters(found: Fitted) -> Table:
+    rows = [
+        [Cell(name), *map(Cell, map(significant, each))] for name, each in found.parameters.items()
+    ]
+    return Table("Parameters", columns("parameter", "before", "identified", "in the model"), rows)
+
+
+def _bands(found: Fitted) -> Table:
+    forecast, units = found.twin.forecast, _units(found)
+    if forecast is None:
+        return Table("", [], [])
+    rows = []
+    for lead, deviation, number in zip(
+        forecast.leads, forecast.deviation, forecast.independent, strict=True
+    ):
+        ahead = f"{significant(lead)} s ahead" if np.isfinite(lead) else "free simulation"
+        widths = zip(deviation, units.values(), strict=True)
+        cells = [Cell(f"± {significant(USUAL * each)}{unit}") for each, unit in widths]
+        rows.append([Cell(ahead), *cells, Cell(f"{number.min():.0f}")])
+    heads = columns("prediction", *units, "independent samples")
+    return Table("Bands by time ahead", heads, rows)
+
+
+def _predictions(found: Fitted) -> Figure:
+    """Measured and predicted outputs of the record of which most was left out."""
+    records = found.records
+    known = np.isfinite(found.predicted)
+    row = int(np.argmax(known.any(axis=2).sum(axis=1)))
+    last = int(records.lengths[row])
+    chosen = np.arange(0, last, max(1, -(-last // SAMPLES)))
+    times = chosen / records.rate
+    panels = []
+    for i in range(min(OUTPUTS, len(records.outputs))):
+        seen = records.mask[row, chosen, i]
+        values = np.where(seen, records.observed[row, chosen, i], np.nan)
+        mean, deviation = found.predicted[row, chosen, i], found.deviation[row, chosen, i]
+        marks: list[Mark] = [
+            Band(times, mean - USUAL * deviation, mean + USUAL * deviation, "90 % band", PREDICTED),
+            Line(times, values, "measured", MEASURED, width=2.2, alpha=0.5),
+            Line(times, mean, "predicted", PREDICTED, width=1.6),
+        ]
+        name, unit = records.outputs.names[i], records.outputs.units[i]
+        x = Axis("time", "s", (0.0, float(times[-1])), count=8)
+        y = Axis(name, "" if unit == "1" else unit)
+        panels.append(Panel(x, [Row(y, marks)], f"{name} over time", name, height=300))
+    keys = [Key("measured", MEASURED), Key("predicted, with its 90 % band", PREDICTED)]
+    return Figure("predictions", panels, keys, str(records.ids[row]), columns=1)

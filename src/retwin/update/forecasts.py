@@ -1,0 +1,186 @@
+"""Predictions by an updated twin: free simulation from commands, or from measurements on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from retwin.data.trajectories import Trajectories
+from retwin.twins.interpolation import TAPS
+from retwin.twins.twin import Twin
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.corrections import Additive
+from retwin.update.dynamics.estimation import correlation_time
+from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.forecast_errors import ForecastErrors, conformal_deviation
+
+DRAWS = 100
+"""Simulations of a trajectory whose mean and deviation stand for a distribution."""
+ORIGINS = 2000
+"""Samples from which predictions start, at most, of all trajectories together."""
+LEADS = (1, 3, 10, 30, 100)
+"""Samples ahead at which errors are calibrated."""
+
+
+def free_moments(twin: Twin, commands: NDArray, *, seed: int = 0) -> tuple[NDArray, NDArray]:
+    """Means and standard deviations (n, T, d_y) of the outputs of commands (n, T, d_u).
+
+    They are exact for corrected dynamics and for corrections of each sample, and those of draws for
+    other corrections; a plain twin is certain.
+    """
+    values = np.asarray(commands, np.float64)
+    if isinstance(twin, DynamicsTwin):
+        return _of_dynamics(twin, values)
+    if not isinstance(twin, CorrectedTwin):
+        made = twin.simulate(values, seed=seed).observed.astype(np.float64)
+        return made, np.zeros_like(made)
+    if isinstance(twin.residual.correction, Additive):
+        context = twin.residual.context(twin.surrogate, commands)
+        with torch.no_grad():
+            found = twin.residual(context)
+            mean = context.nominal.double() + twin.residual.mean(context)
+        return mean.numpy(), found.variance.double().sqrt().numpy()
+    moments = []
+    for i, each in enumerate(values):
+        drawn = twin.simulate(np.tile(each, (DRAWS, 1, 1)), seed=seed + i).observed
+        moments.append((drawn.mean(axis=0, dtype=np.float64), drawn.std(axis=0, dtype=np.float64)))
+    means, deviations = (np.stack(each) for each in zip(*moments, strict=True))
+    return means, deviations
+
+
+def _of_dynamics(twin: DynamicsTwin, commands: NDArray) -> tuple[NDArray, NDArray]:
+    """By the linear propagation of the uncertain parameters, starts and noise."""
+    simulation, states = twin.simulation, len(twin.process)
+    factor = np.concatenate([twin.factor, np.zeros((len(twin.values), states))], axis=1)
+    factor[-states:, -states:] = np.diag(twin.start_deviation)
+    theta = np.tile(twin.values, (len(commands), 1))
+    mean, slopes = twin.equations.steps().sensitivities(commands, theta)
+    variance = simulation.noise_variance(commands) + np.sum((slopes @ factor) ** 2, axis=-1)
+    return mean, twin.widening * np.sqrt(variance)
+
+
+@dataclass(frozen=True, eq=False)
+class Forecasts:
+    """Predictions of the samples of a record from measurements some time before.
+
+    Attributes
+    ----------
+    mean : NDArray
+        (L, n, T, d_y), predictions some samples ahead; NaN where none was made.
+    last : NDArray
+        (L, n, T, d_y), the last error of the free simulation at that time, of which a share is
+        still to be added; 0 where states are filtered.
+
+    """
+
+    mean: NDArray
+    last: NDArray
+
+
+def forecasts(twin: Twin, record: Trajectories, leads: Sequence[int]) -> Forecasts:
+    """Predict the samples of a record so many samples ahead of the last measurement.
+
+    Parameters
+    ----------
+    twin : Twin
+        A `DynamicsTwin` continues from filtered states; another one simulates from the commands.
+    record : Trajectories
+        Measured outputs with their commands.
+    leads : sequence of int
+        Samples ahead, at least 1.
+
+    """
+    if isinstance(twin, DynamicsTwin):
+        made = _from_states(twin, record, leads)
+        return Forecasts(made, np.zeros_like(made))
+    free = free_moments(twin, record.commands)[0]
+    error = np.where(record.mask, record.observed - free, np.nan)
+    mean, last = (np.full((len(leads), *free.shape), np.nan) for _ in range(2))
+    present = _last_measured(error)
+    for i, lead in enumerate(leads):
+        if lead < free.shape[1]:
+            mean[i, :, lead:] = free[:, lead:]
+            last[i, :, lead:] = present[:, :-lead]
+    return Forecasts(np.where(np.isfinite(last), mean, np.nan), last)
+
+
+def _last_measured(error: NDArray) -> NDArray:
+    """At each sample, the last error (n, T, d_y) that is no NaN."""
+    steps = np.arange(error.shape[1])[:, None]
+    place = np.maximum.accumulate(np.where(np.isfinite(error), steps, 0), axis=1)
+    return np.take_along_axis(error, place, axis=1)
+
+
+def _from_states(twin: DynamicsTwin, record: Trajectories, leads: Sequence[int]) -> NDArray:
+    """Simulations that start from filtered states at some samples, (L, n, T, d_y)."""
+    commands = record.commands.astype(np.float64)
+    measured = np.where(record.mask, record.observed, 0.0).astype(np.float64)
+    states = twin.filter(commands, measured, record.mask)[2]
+    count, steps = commands.shape[:2]
+    longest = min(max(leads), steps - 1)
+    stride = max(1, count * steps // ORIGINS)
+    row, origin = (each.ravel() for each in np.mgrid[:count, 0 : steps - 1 : stride])
+    # Earlier commands, on which a spline between samples and dead times depend.
+    delays = [twin.values[place] for _, place in twin.equations.delay_places]
+    past = TAPS + ceil(max(delays, default=0.0) * record.rate) + 1
+    place = np.clip(origin[:, None] + np.arange(-past, longest + 1), 0, steps - 1)
+    theta = np.tile(twin.values, (len(row), 1))
+    theta[:, -states.shape[2] :] = states[row, origin]
+    found = twin.equations.steps().run(commands[row[:, None], place], theta, first=past)[0]
+    made = np.full((len(leads), count, steps, found.shape[2]), np.nan)
+    for i, lead in enumerate(leads):
+        inside = origin + lead < steps
+        if lead <= longest:
+            made[i, row[inside], origin[inside] + lead] = found[inside, lead]
+    return made
+
+
+def calibrate_forecasts(
+    found: Sequence[tuple[Forecasts, NDArray, Trajectories, NDArray]], leads: Sequence[int]
+) -> ForecastErrors:
+    """The errors of predictions, from parts of records that the models were not fitted to.
+
+    Parameters
+    ----------
+    found : sequence of (Forecasts, NDArray, Trajectories, NDArray)
+        Of each model: predictions, means (n, T, d_y) of the free simulation, the record, and which
+        of its samples (n, T) it was not fitted to.
+    leads : sequence of int
+        Samples ahead of the predictions.
+
+    """
+    record, rows = found[0][2], []
+    for i in range(len(leads) + 1):
+        pairs = []
+        for made, free, each, part in found:
+            mean, last = (free, 0.0 * free) if i == len(leads) else (made.mean[i], made.last[i])
+            seen = each.mask & part[..., None] & np.isfinite(mean)
+            pairs.append((np.where(seen, each.observed - mean, np.nan), np.where(seen, last, 0.0)))
+        rows.append([_calibrated(pairs, channel) for channel in range(len(record.outputs))])
+    persistence, deviation, independent = np.moveaxis(np.array(rows), 2, 0)
+    times = np.append(np.array(leads) / record.rate, np.inf)
+    return ForecastErrors(times, persistence, deviation, independent)
+
+
+def _calibrated(pairs: Sequence[tuple[NDArray, NDArray]], channel: int) -> tuple[float, ...]:
+    """Persistence, deviation and number of independent errors of an output."""
+    errors = [each[..., channel] for each, _ in pairs]
+    last = np.concatenate(
+        [each[..., channel][np.isfinite(e)] for (_, each), e in zip(pairs, errors, strict=True)]
+    )
+    flat = np.concatenate([each[np.isfinite(each)] for each in errors])
+    if not len(flat):
+        return 0.0, 0.0, 0.0
+    power = float(last @ last)
+    share = float(np.clip(last @ flat / power, 0.0, 1.0)) if power > 0 else 0.0
+    left = flat - share * last
+    number = 0.0
+    for (_, each), error in zip(pairs, errors, strict=True):
+        rest = np.where(np.isfinite(error), error - share * each[..., channel], 0.0)
+        number += np.isfinite(error).sum() / correlation_time(rest[..., None])
+    return share, conformal_deviation(left, number), number

@@ -1,0 +1,55 @@
+"""`load_twin`: whatever an update saved, from its folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from retwin.errors import InputError
+from retwin.serialisation.models import kind_of
+
+if TYPE_CHECKING:
+    from retwin.update.corrected import CorrectedTwin
+    from retwin.update.dynamics import DynamicsTwin
+
+IDENTIFICATION = "identification.json"
+"""A file in the folder of an identification."""
+
+
+def load_twin(folder: str | Path) -> CorrectedTwin | DynamicsTwin:
+    """The updated twin that `rt.fit`, `retwin fit` or the method `save` of a twin wrote.
+
+    Parameters
+    ----------
+    folder : path
+        The folder of the model.
+
+    Returns
+    -------
+    CorrectedTwin or DynamicsTwin
+        Both are a `Twin`. The twin of a case that has no equations is opened by the name of the
+        case, which may run the user's code.
+
+    Raises
+    ------
+    InputError
+        The folder is missing, damaged, or holds something else.
+
+    """
+    from retwin.update.corrected import CorrectedTwin
+    from retwin.update.dynamics import DynamicsTwin
+
+    kind = kind_of(folder)
+    if kind not in (DynamicsTwin.kind, "corrected"):
+        got = f"a {kind}" if kind else "none"
+        remedy = "give the folder that fit wrote"
+        if (Path(folder) / IDENTIFICATION).is_file():
+            got = "the folder of an identification"
+            remedy = f"fit its twin first: retwin fit {Path(folder) / 'updated.toml'} --real LOG"
+        raise InputError(
+            str(folder),
+            expected="the folder of an updated twin, with its model.json",
+            got=got,
+            remedy=remedy,
+        )
+    return (DynamicsTwin if kind == DynamicsTwin.kind else CorrectedTwin).load(folder)

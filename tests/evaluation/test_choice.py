@@ -1,0 +1,207 @@
+"""`rt.fit`: the correction of a twin, chosen by parts of its records that are left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import retwin as rt
+from retwin.evaluation import predict_records
+from retwin.evaluation.choice.comparison import Comparison, Predicted
+from retwin.evaluation.choice.folds import Fold, block_means, folds_of
+from retwin.twins import State, StateTwin
+from retwin.update import StationaryNoise, free_moments
+
+INPUTS, OUTPUTS = rt.Channels(("power",), ("W",)), rt.Channels(("heat",), ("K",))
+FAST = ("none", "parameters", "dynamics")
+
+
+def twin_of(sign: float = 1.0, delay: float | None = None) -> StateTwin:
+    """A heater that loses heat in proportion to its temperature."""
+    parameters = [
+        rt.Parameter("gain", "K/J", 0.01, 2.0, 0.2),
+        rt.Parameter("loss", "1/s", 0.01, 0.5, 0.1),
+    ]
+    if delay is not None:
+        parameters.append(rt.Parameter("dead", "s", 0.0, 10.0, delay))
+    return StateTwin(
+        (State("heat", "K", 0.0),),
+        lambda x, u, p: x.heat,
+        INPUTS,
+        OUTPUTS,
+        1.0,
+        derivative=lambda x, u, p: (sign * p.gain * u.power - p.loss * x.heat,),
+        parameters=parameters,
+        delays={} if delay is None else {"power": "dead"},
+    )
+
+
+def measured(
+    seed: int, slope: Callable[[float, float], float], *, steps: int = 600, delay: int = 0
+) -> tuple[NDArray, NDArray]:
+    """Commands and outputs of a real heater, whose sensor has white noise of 0.01 K."""
+    rng = np.random.default_rng(seed)
+    power = np.repeat(rng.uniform(0, 2, steps // 15 + 1), 15)[:steps]
+    heat, made = 0.0, []
+    for k in range(steps):
+        made.append(heat)
+        for _ in range(10):
+            heat += 0.1 * slope(heat, power[max(k - delay, 0)])
+    return power, np.array(made) + 0.01 * rng.normal(size=steps)
+
+
+def records(*seeds: int, slope: Callable[[float, float], float], **more: int) -> rt.Trajectories:
+    pairs = [measured(seed, slope, **more) for seed in seeds]
+    power, heat = (np.stack(each)[..., None] for each in zip(*pairs, strict=True))
+    return rt.Trajectories(power, np.zeros_like(heat), heat, 1.0, inputs=INPUTS, outputs=OUTPUTS)
+
+
+def right(heat: float, power: float) -> float:
+    return 0.3 * power - 0.08 * heat
+
+
+def radiating(heat: float, power: float) -> float:
+    return 0.3 * power - 0.08 * heat - 0.03 * heat**2
+
+
+def test_a_right_twin_has_nothing_to_correct() -> None:
+    found = rt.fit(twin_of(), records(0, slope=right), rt.Choice(candidates=FAST))
+    assert found.chosen == "parameters"
+    assert any(each.startswith("Nothing to correct") for each in found.remarks)
+    _, alone, now = found.parameters["gain"]
+    assert alone == now == pytest.approx(0.3, rel=0.01)
+
+
+def test_what_the_equations_lack_is_learned_and_predicts_another_record() -> None:
+    found = rt.fit(twin_of(), records(0, slope=radiating), rt.Choice(candidates=FAST))
+    assert found.chosen == found.preferred == "dynamics"
+    assert found.score("dynamics").rmse["heat"] < 0.5 * found.score("parameters").rmse["heat"]
+    scores = {s.who: s for s in rt.score_model(found.twin, records(5, slope=radiating))}
+    assert scores["model"].rmse < 0.2 * scores["mean"].rmse
+    assert list(scores) == ["model", "mean", "hold"]
+
+
+def test_bands_hold_what_they_promise_of_other_records() -> None:
+    """Over records that were not used, at each time ahead; errors are those of 1200 samples."""
+    found = rt.fit(twin_of(), records(0, 1, slope=radiating), rt.Choice(candidates=FAST))
+    others = records(7, 8, slope=radiating)
+    assert found.twin.forecast is not None
+    for horizon in (None, 1.0, 10.0, 30.0):
+        (own, *_) = rt.score_model(found.twin, others, horizon=horizon, warm_up=5.0)
+        assert 0.8 <= own.coverage <= 0.98, horizon
+        assert own.width < 1.6 * 3.29 * own.rmse
+
+
+def test_a_wrong_sign_is_mentioned() -> None:
+    found = rt.fit(twin_of(sign=-1.0), records(0, slope=right), rt.Choice(candidates=("none",)))
+    assert any("check the sign" in each for each in found.remarks)
+
+
+def test_a_missing_dead_time_is_mentioned_with_its_value() -> None:
+    data = records(0, slope=right, delay=4)
+    found = rt.fit(twin_of(), data, rt.Choice(candidates=("parameters",)))
+    (said,) = [each for each in found.remarks if each.startswith("A dead time of")]
+    # Without a dead time, a smaller gain and loss imitate a part of it.
+    assert 1.5 < float(said.split()[4]) < 5.0
+    known = rt.fit(twin_of(delay=1.0), data, rt.Choice(candidates=("parameters",)))
+    assert not any("dead time" in each for each in known.remarks)
+    assert known.parameters["dead"][2] == pytest.approx(4.0, abs=0.2)
+
+
+@pytest.mark.parametrize("method", ["none", "dynamics"])
+def test_a_saved_model_predicts_the_same(tmp_path: Path, method: str) -> None:
+    data = records(0, slope=radiating)
+    found = rt.fit(twin_of(), data, rt.Choice(candidates=FAST, method=method))
+    assert found.chosen == method
+    assert any("The method was given" in each for each in found.remarks) == (method == "none")
+    found.save(tmp_path / "model")
+    again = rt.load_twin(tmp_path / "model")
+    for horizon in (None, 3.0):
+        one, other = (predict_records(m, data, horizon=horizon) for m in (found.twin, again))
+        np.testing.assert_allclose(one.mean, other.mean, atol=1e-6)
+        np.testing.assert_allclose(one.deviation, other.deviation, rtol=1e-6)
+
+
+def test_a_twin_that_cannot_be_opened_again_is_not_saved(tmp_path: Path) -> None:
+    twin = rt.FunctionTwin(lambda u: np.cumsum(u, axis=1) * 0.1, INPUTS, OUTPUTS, 1.0)
+    found = rt.fit(twin, records(0, slope=right), rt.Choice(candidates=("none",)))
+    with pytest.raises(rt.InputError, match=r"case.*can be opened again"):
+        found.save(tmp_path / "model")
+    assert not (tmp_path / "model").exists()
+
+
+def test_an_identification_is_named_where_a_model_is_expected(tmp_path: Path) -> None:
+    (tmp_path / "identification.json").write_text("{}")
+    with pytest.raises(rt.InputError, match="the folder of an identification"):
+        rt.load_twin(tmp_path)
+
+
+def test_folds_leave_out_what_is_measured_and_never_the_start_of_one_record() -> None:
+    data = records(0, slope=right, steps=400)
+    folds = folds_of(data)
+    time = np.stack([each.held for each in folds if not each.edge])
+    assert (time.sum(axis=0) <= 1).all()
+    assert not np.stack([each.held for each in folds])[:, :, :10].any()
+    edge = next(each for each in folds if each.edge)
+    reach = np.abs(data.observed[..., 0] - data.observed.mean())
+    assert reach[edge.held].mean() > reach[~edge.held].mean()
+    kept = edge.training(data)
+    assert not (kept.mask[..., 0] & edge.held).any()
+    np.testing.assert_array_equal(kept.commands, data.commands)
+    many = folds_of(records(*range(6), slope=right, steps=60))
+    assert all((each.held.all(axis=1) | ~each.held.any(axis=1)).all() for each in many)
+    assert sum(each.held for each in many if not each.edge).all()
+
+
+def test_the_simplest_within_a_standard_error_is_taken() -> None:
+    rng = np.random.default_rng(0)
+    data = records(0, slope=right)
+    folds = folds_of(data)
+
+    def guessed(error: float) -> list[Predicted]:
+        made = []
+        for fold in folds:
+            y = data.observed[fold.rows].astype(float)
+            mean = y + error * rng.normal(size=y.shape)
+            made.append(Predicted(mean, np.ones_like(y), np.zeros_like(y)))
+        return made
+
+    models = {"simple": guessed(0.1), "same": guessed(0.1), "better": guessed(0.05)}
+    chosen, differences = Comparison(data, folds, models).simplest()
+    assert chosen == "better"
+    assert differences["better"] == (0.0, 0.0)
+    del models["better"]
+    assert Comparison(data, folds, models).simplest()[0] == "simple"
+
+
+def test_block_means_are_those_of_consecutive_samples() -> None:
+    values = np.arange(12.0).reshape(1, 12)
+    values[0, 6:8] = np.nan
+    np.testing.assert_allclose(block_means(values, 5), [2.0, 8.6])
+    assert Fold("x", np.isfinite(values)).rows.tolist() == [0]
+
+
+def test_stationary_noise_has_the_spread_and_the_persistence_of_the_errors() -> None:
+    rng = np.random.default_rng(1)
+    noise = np.zeros((4, 3000))
+    for t in range(1, 3000):
+        noise[:, t] = 0.8 * noise[:, t - 1] + 0.6 * rng.normal(size=4)
+    twin = twin_of()
+    power = rng.random((4, 3000, 1))
+    nominal = twin.simulate(power, seed=0).nominal
+    data = rt.Trajectories(
+        power, nominal, nominal + noise[..., None], 1.0, inputs=INPUTS, outputs=OUTPUTS
+    ).replace(labels=["Healthy"] * 4)
+    residual = rt.fit_residual(twin, data, rt.Additive(), StationaryNoise(), seed=0)
+    assert float(residual.scale) == pytest.approx(1.0, abs=0.06)
+    assert float(residual.persistence) == pytest.approx(0.8, abs=0.02)
+    model = rt.CorrectedTwin(twin, residual)
+    drawn = model.simulate(power, seed=3).observed - nominal
+    assert drawn.std() == pytest.approx(1.0, abs=0.06)
+    mean, deviation = free_moments(model, power)
+    np.testing.assert_allclose(mean, nominal, atol=1e-6)
+    np.testing.assert_allclose(deviation, float(residual.scale), rtol=1e-6)

@@ -1,0 +1,152 @@
+"""Integrating and unstable plants: windows whose starts are estimated, and when they are used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+import retwin as rt
+from retwin.evaluation import hold_out, validate_identification
+from retwin.report.identification.texts import findings
+from retwin.twins import FunctionTwin, Parameter, ParametricTwin, State, StateTwin
+from retwin.update.identification import LeastSquares, identify
+from retwin.update.identification.misfit import misfit_of
+
+RATE, GAIN = 50.0, 3.2
+INPUTS, OUTPUTS = rt.Channels(("u",), ("V",)), rt.Channels(("y",), ("m",))
+CART = StateTwin(
+    (State("position", "m"), State("velocity", "m/s")),
+    lambda x, u, p: x.position,
+    INPUTS,
+    OUTPUTS,
+    RATE,
+    derivative=lambda x, u, p: (x.velocity, p.gain * u.u),
+    parameters=(Parameter("gain", "m/s2/V", 0.1, 10.0, 1.0),),
+)
+LAG = replace(
+    CART,
+    states=(State("level", "m"),),
+    output=lambda x, u, p: x.level,
+    derivative=lambda x, u, p: (p.gain * u.u - 2.0 * x.level,),
+)
+QUICK = LeastSquares(starts=1)
+pytestmark = pytest.mark.filterwarnings("ignore:at a bound")
+
+
+def record(commands: np.ndarray, outputs: np.ndarray) -> rt.Trajectories:
+    return rt.Trajectories(
+        commands, np.zeros_like(outputs), outputs, RATE, inputs=INPUTS, outputs=OUTPUTS
+    )
+
+
+def in_closed_loop(seed: int = 0, seconds: float = 30.0) -> rt.Trajectories:
+    """A cart under feedback, with friction and a slow force that no twin has."""
+    rng, period = np.random.default_rng(seed), 1 / RATE
+    x, v, force, aim = 0.3, 0.3, 0.0, 0.0
+    commands, outputs = [], []
+    for k in range(round(seconds * RATE)):
+        if k % 150 == 0:
+            aim = rng.uniform(-1, 1)
+        y = x + 2e-3 * rng.normal()
+        u = np.clip(1.5 * (aim - y) - 0.9 * v, -2, 2)
+        commands.append(u)
+        outputs.append(y)
+        force += -period * force / 5 + 0.05 * np.sqrt(period) * rng.normal()
+        a = GAIN * u + force + 0.02 - 0.02 * np.tanh(v / 0.01)
+        x, v = x + period * v + period**2 / 2 * a, v + period * a
+    return record(np.array(commands)[None, :, None], np.array(outputs)[None, :, None])
+
+
+@pytest.fixture(scope="module")
+def cart() -> rt.Trajectories:
+    return in_closed_loop()
+
+
+def test_an_integrating_plant_is_fitted_in_windows(cart: rt.Trajectories) -> None:
+    found = identify(CART.parametric(), cart, QUICK, seed=0)
+    whole = identify(CART.parametric(), cart, QUICK, seed=0, horizon=np.inf)
+    assert whole.horizon == np.inf
+    assert found.horizon < cart.steps / RATE / 5
+    assert abs(found.values["gain"] - GAIN) < abs(whole.values["gain"] - GAIN) / 3
+    assert found.horizons[0].error < next(e.error for e in found.horizons if e.length is None)
+
+
+def test_the_page_has_the_error_of_predictions_and_of_the_mean(cart: rt.Trajectories) -> None:
+    used, held_out = hold_out(cart, 0.25, seed=0)
+    before = CART.parametric()
+    texts = {}
+    for horizon in (None, np.inf):
+        found = identify(before, used, QUICK, seed=0, horizon=horizon)
+        texts[horizon] = " ".join(
+            findings(validate_identification(found, before, used, held_out, seed=0))
+        )
+    assert "from estimated starts" in texts[None]
+    assert "the record's mean alone has" in texts[None]
+    assert "fitted in windows of" in texts[None]
+    assert "worse than the record's mean" in texts[np.inf]
+
+
+def test_derivatives_are_those_of_the_misfit_whose_starts_follow(cart: rt.Trajectories) -> None:
+    with misfit_of(CART.parametric(), cart, seed=0, rate=None, processes=1, length=100) as misfit:
+        theta, step = np.array([2.0]), 1e-4
+        slope = misfit.derivatives(theta)
+        assert slope is not None
+        gradient = 2 * slope[:, 0] @ misfit.residuals(theta[None]).ravel()
+        ends = [np.sum(misfit.residuals(np.array([[2.0 + e]])) ** 2) for e in (step, -step)]
+    assert gradient == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-4)
+
+
+def test_an_unstable_plant_is_fitted_although_its_free_simulation_fails() -> None:
+    def derivative(x, u, p):
+        return (x.velocity, p.gain * u.u + 9.0 * x.position)
+
+    unstable = replace(CART, derivative=derivative)
+    rng = np.random.default_rng(1)
+    x, v, commands, outputs = 0.01, 0.0, [], []
+    for _ in range(1000):
+        u = -8.0 * x - 2.0 * v + 0.2 * rng.normal()
+        commands.append(u)
+        outputs.append(x + 1e-4 * rng.normal())
+        for _ in range(10):
+            a = GAIN * u + 9.0 * x + 0.1 * rng.normal()
+            x, v = x + v / RATE / 10, v + a / RATE / 10
+    observed = record(np.array(commands)[None, :, None], np.array(outputs)[None, :, None])
+    found = identify(unstable.parametric(), observed, QUICK, seed=0)
+    assert found.values["gain"] == pytest.approx(GAIN, rel=0.1)
+
+
+def test_a_stable_plant_is_simulated_freely() -> None:
+    commands = np.repeat(np.random.default_rng(0).uniform(-1, 1, (1, 40, 1)), 25, axis=1)
+    made = LAG.simulate(commands, seed=0, parameters={"gain": GAIN}).observed
+    found = identify(LAG.parametric(), record(commands, made), QUICK, seed=0)
+    assert (found.horizon, found.horizons, found.lasting) == (np.inf, (), False)
+    assert found.values["gain"] == pytest.approx(GAIN, rel=1e-3)
+
+
+def test_what_windows_would_need_is_said_of_a_function(cart: rt.Trajectories) -> None:
+    def twice(commands: np.ndarray, gain: float) -> np.ndarray:
+        return np.cumsum(np.cumsum(gain * commands, axis=-2), axis=-2) / RATE**2
+
+    def build(values) -> FunctionTwin:
+        return FunctionTwin(partial(twice, **values), INPUTS, OUTPUTS, RATE)
+
+    twin = ParametricTwin.built(build, CART.parameters)
+    found = identify(twin, cart, QUICK, seed=0)
+    assert found.lasting
+    texts = " ".join(findings(validate_identification(found, twin, cart)))
+    assert "write its equations as a StateTwin" in texts
+    with pytest.raises(rt.InputError, match="none for a twin without states"):
+        identify(twin, cart, QUICK, seed=0, horizon=2.0)
+
+
+def test_a_start_is_inferred_unless_it_is_given() -> None:
+    commands = np.repeat(np.random.default_rng(0).uniform(-1, 1, (2, 8, 1)), 25, axis=1)
+    given = {"gain": np.full(2, GAIN), "start_level": np.array([1.5, -2.0])}
+    observed = record(commands, LAG.simulate(commands, seed=0, parameters=given).observed)
+    free = identify(LAG.parametric(), observed, QUICK, seed=0)
+    assert free.values["gain"] == pytest.approx(GAIN, rel=1e-3)
+    fixed = replace(LAG, states=(State("level", "m", 0.0),)).parametric()
+    assert identify(fixed, observed, QUICK, seed=0).values["gain"] != pytest.approx(GAIN, rel=0.05)
