@@ -81,14 +81,14 @@ def dynamics(system: System) -> Models:
 
 
 def choice(system: System) -> Models:
-    fitted = rt.fit(system.twin, system.calibration, horizon=system.horizon, seed=0)
+    fitted = rt.fit(system.twin, system.calibration, rt.Choice(horizon=system.horizon), seed=0)
     yield "fit", fitted.twin, fitted.chosen
 
 
 def black_box(kind: str) -> Any:
     def fit(system: System) -> Models:
         fitted = fit_black_box(system.calibration, kind, seed=0)
-        yield kind, fitted.twin, f"order {fitted.figures['order']:g}"
+        yield kind, fitted.twin, ", ".join(f"{k} {v:.3g}" for k, v in fitted.figures.items())
 
     return fit
 
@@ -187,9 +187,10 @@ def ahead(model: Any, tests: rt.Trajectories, samples: int, warm: int) -> Sequen
         square, *others = record_means(plain(later, outputs)).mean(axis=0).tolist()
         return np.sqrt(square), *others
     try:
+        model = started(model, tests.between(0, warm / tests.rate)) if warm else model
         options = {"horizon": samples / tests.rate, "warm_up": first / tests.rate}
         rows = [row for row in rt.score_model(model, tests, **options) if row.who == "model"]
-    except (AttributeError, rt.InputError):  # a model that cannot be started from measurements
+    except rt.InputError:  # a model that cannot be started from measurements
         return (np.nan,) * 4
     others = np.mean([[row.crps, row.coverage, row.width] for row in rows], axis=0)
     return float(np.sqrt(np.mean([row.rmse**2 for row in rows]))), *others.tolist()
