@@ -30,8 +30,8 @@ def test_a_twin_that_is_right_has_no_error_once_its_start_is_inferred(modules):
     start = {"start_position": 1.0, "start_speed": 0.5}
     record = cart.CART.simulate(force, seed=0, parameters=start)
     right = cart.CART.parametric()
-    assert methods.free(right, record, 20)[0] < 1e-4
-    assert methods.free(right, record, 0)[0] > 1.0
+    assert methods.averaged(right, record, None, 20)[0] < 1e-4
+    assert methods.averaged(right, record, None, 0)[0] > 1.0
 
 
 def test_constants_are_scored_at_the_samples_after_the_warm_up(modules):

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import retwin as rt
-from retwin.evaluation import record_means, simulate_records
 from retwin.twins import StateTwin
 from retwin.update import DynamicsTwin, fit_black_box, fit_dynamics, fit_state_surrogate
 from systems.system import System
 
-DRAWS = 200
+SCORES = ("rmse", "crps", "coverage", "width")
 AHEAD = (1, 10, 100)
 """Samples ahead of the last measurement of which predictions are scored."""
 Models = Iterator[tuple[str, Any, str]]
@@ -28,10 +27,6 @@ class Constant:
     def __init__(self, system: System, *, hold: bool) -> None:
         seen = np.where(system.calibration.mask, system.calibration.observed, np.nan)
         self.mean, self.hold = np.nanmean(seen, axis=(0, 1)), hold
-
-    def predict(self, record: rt.Trajectories, warm: int) -> NDArray:
-        """The same outputs (d_y,) at all samples."""
-        return record.observed[0, max(0, warm - 1)] if self.hold else self.mean
 
 
 def without_model(system: System) -> Models:
@@ -81,14 +76,14 @@ def dynamics(system: System) -> Models:
 
 
 def choice(system: System) -> Models:
-    fitted = rt.fit(system.twin, system.calibration, horizon=system.horizon, seed=0)
+    fitted = rt.fit(system.twin, system.calibration, rt.Choice(horizon=system.horizon), seed=0)
     yield "fit", fitted.twin, fitted.chosen
 
 
 def black_box(kind: str) -> Any:
     def fit(system: System) -> Models:
         fitted = fit_black_box(system.calibration, kind, seed=0)
-        yield kind, fitted.twin, f"order {fitted.figures['order']:g}"
+        yield kind, fitted.twin, ", ".join(f"{k} {v:.3g}" for k, v in fitted.figures.items())
 
     return fit
 
@@ -138,58 +133,45 @@ def started(model: Any, warm: rt.Trajectories) -> Any:
 def score(model: Any, system: System, tests: rt.Trajectories) -> Mapping[str, float]:
     """RMSE, CRPS, what 90 % bands hold, and their width; RMSE some samples ahead."""
     warm = round(system.warm_up * tests.rate)
-    later = {n: ahead(model, tests, n, warm) for n in AHEAD}
-    if system.horizon is None:
-        scores = free(model, tests, warm)
-    else:
-        scores = ahead(model, tests, round(system.horizon * tests.rate), warm)
-    found = dict(zip(("rmse", "crps", "coverage", "width"), scores, strict=True))
-    found |= {f"ahead {n}": each[0] for n, each in later.items()}
+    judged = None if system.horizon is None else round(system.horizon * tests.rate)
+    found = dict(zip(SCORES, averaged(model, tests, judged, warm), strict=True))
+    found |= {f"ahead {n}": averaged(model, tests, n, warm)[0] for n in AHEAD}
     return {name: (1 if name == "coverage" else system.scale) * v for name, v in found.items()}
 
 
-def free(model: Any, tests: rt.Trajectories, warm: int) -> Sequence[float]:
-    """Scores of free simulation after the samples of the warm-up."""
-    parts = []
-    for index in range(len(tests)):
-        record = tests[[index]]
-        if isinstance(model, Constant):
-            each = plain(
-                record, np.broadcast_to(model.predict(record, warm), record.observed.shape)
-            )
-        else:
-            own = started(model, record.between(0, warm / record.rate)) if warm else model
-            made = simulate_records(own, record, draws=DRAWS, seed=index)
-            width = np.where(record.mask, made.bands[:, -1] - made.bands[:, 0], np.nan)
-            square, crps, _, held, _ = np.moveaxis(made.per_sample(), -1, 0)
-            each = np.stack([square, crps, held, width if made.random else held], -1)
-        parts.append(each[:, warm:])
-    square, *others = record_means(np.concatenate(parts)).mean(axis=0).tolist()
+def averaged(model: Any, tests: rt.Trajectories, samples: int | None, warm: int) -> Sequence[float]:
+    """Scores of free simulation, or so many samples ahead of the last measurement, of all records.
+
+    They are NaN where a model cannot be started from measurements.
+    """
+    first = max(warm, samples or 0)
+    if first >= tests.steps:
+        return (np.nan,) * len(SCORES)
+    try:
+        parts = [scores(model, tests[[i]], samples, warm, first) for i in range(len(tests))]
+    except rt.InputError:
+        return (np.nan,) * len(SCORES)
+    square, *others = np.mean(np.concatenate(parts), axis=0).tolist()
     return np.sqrt(square), *others
 
 
-def plain(record: rt.Trajectories, outputs: NDArray) -> NDArray:
-    """Squared and absolute errors (n, T, d_y, 4) of outputs without bands."""
-    error = np.where(record.mask, np.abs(record.observed - outputs), np.nan)
-    none = np.full(error.shape, np.nan)
-    return np.stack([error**2, error, none, none], -1)
-
-
-def ahead(model: Any, tests: rt.Trajectories, samples: int, warm: int) -> Sequence[float]:
-    """Scores so many samples ahead of the last measurement; NaN where there are none."""
-    first = max(warm, samples)
-    if first >= tests.steps:
-        return (np.nan,) * 4
+def scores(
+    model: Any, record: rt.Trajectories, samples: int | None, warm: int, first: int
+) -> NDArray:
+    """Mean square of the error, CRPS, coverage and width of each output of a record."""
     if isinstance(model, Constant):
-        held = np.where(tests.mask, tests.observed, np.nan)[:, first - samples : -samples]
-        outputs = held if model.hold else np.broadcast_to(model.mean, held.shape)
-        later = tests.between(first / tests.rate, tests.steps / tests.rate)
-        square, *others = record_means(plain(later, outputs)).mean(axis=0).tolist()
-        return np.sqrt(square), *others
-    try:
-        options = {"horizon": samples / tests.rate, "warm_up": first / tests.rate}
-        rows = [row for row in rt.score_model(model, tests, **options) if row.who == "model"]
-    except (AttributeError, rt.InputError):  # a model that cannot be started from measurements
-        return (np.nan,) * 4
-    others = np.mean([[row.crps, row.coverage, row.width] for row in rows], axis=0)
-    return float(np.sqrt(np.mean([row.rmse**2 for row in rows]))), *others.tolist()
+        measured = np.where(record.mask, record.observed, np.nan)[0]
+        outputs = np.broadcast_to(model.mean, measured.shape)[first:]
+        if model.hold:
+            outputs = (
+                measured[first - samples : -samples] if samples else measured[max(0, warm - 1)]
+            )
+        error = np.abs(measured[first:] - outputs)
+        none = np.full(error.shape[1], np.nan)
+        return np.stack([np.nanmean(error**2, 0), np.nanmean(error, 0), none, none], 1)
+    rate = record.rate
+    own = started(model, record.between(0, warm / rate)) if warm else model
+    horizon = samples / rate if samples else None
+    rows = rt.score_model(own, record, horizon=horizon, warm_up=first / rate)
+    found = [[row.rmse**2, row.crps, row.coverage, row.width] for row in rows if row.who == "model"]
+    return np.array(found)
