@@ -92,7 +92,7 @@ def _state_surrogate(system: Case, measured: Trajectories, seed: int) -> FittedS
             progress=lambda s: show("state surrogate", s),
         )
     errors = (
-        f"{found.figures[f'own_{name}']:.3g}{'' if unit == '1' else f' {unit}'} of {name}"
+        f"{found.figures[f'own_{name}']:.3g} {unit} of {name}"
         for name, unit in zip(found.twin.outputs.names, found.twin.outputs.units, strict=True)
     )
     note(
