@@ -110,6 +110,15 @@ def positive(argument: str, value: Any, *, unit: str = "", remedy: str = "") -> 
     return float(value)
 
 
+def apart(one: float, other: float) -> tuple[str, str]:
+    """Two numbers as texts, with three digits or as many as make them differ."""
+    for digits in range(3, 17):
+        made = f"{one:.{digits}g}", f"{other:.{digits}g}"
+        if made[0] != made[1]:
+            break
+    return made
+
+
 def whole(
     argument: str, value: Any, *, least: int = 0, most: int | None = None, remedy: str = ""
 ) -> int:

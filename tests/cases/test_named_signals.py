@@ -105,7 +105,7 @@ def test_topics_at_several_rates_are_found_by_their_last_names(tmp_path: Path) -
                 writer.add_message(channel, stamp, json.dumps({field: k / rate}).encode(), stamp)
         writer.finish()
     reader = LogReader()
-    assert reader.rate(tmp_path / "a.mcap", TWIN) == 5
+    assert reader.rate(tmp_path / "a.mcap", (*TWIN.inputs.names, *TWIN.outputs.names)) == 5
     assert reader.measured_outputs([tmp_path / "a.mcap"], TWIN) == ("speed", "level")
     made = reader.trajectories([tmp_path / "a.mcap"], TWIN).trajectories
     np.testing.assert_allclose(made.observed[0, :90, 0], np.arange(90) / 10, atol=1e-6)

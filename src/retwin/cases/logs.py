@@ -155,8 +155,8 @@ class LogReader:
     max_bytes: int | None = None
     _read: dict[tuple[Path, Clock], Log] = field(default_factory=dict, repr=False)
 
-    def rate(self, path: str | Path, twin: Twin) -> float | None:
-        """The sample rate of a log in Hz, by the median interval of the signals of a twin.
+    def rate(self, path: str | Path, names: Sequence[str]) -> float | None:
+        """The sample rate of a log in Hz, by the median interval of the signals of some channels.
 
         That of a log with a mapping is the mapping's. Returns None for a table without times.
         Raises InputError for a log that cannot be read, or whose times do not increase.
@@ -169,7 +169,6 @@ class LogReader:
         log = self._log(path, 1.0)
         if not has_times(log, self.columns.time):
             return None
-        names = (*twin.inputs.names, *twin.outputs.names)
         found = signals_of(log, names, self.columns.names)
         steps = [np.diff(log.signals[each].times) for each in found.values()]
         medians = [float(np.median(each)) for each in steps if len(each)]

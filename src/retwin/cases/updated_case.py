@@ -29,7 +29,9 @@ SUFFICIENT = 0.1
 root mean square of both together is 0.5 % larger."""
 STATE_EQUATIONS = (
     "For retwin fit --dynamics: the state equations, which the twin does not show, are learned "
-    "from simulations until their error is this share of the twin's discrepancy in the logs."
+    "from simulations until their error is this share of the twin's discrepancy in the logs. These "
+    "draw each parameter from this share of its range about its start, five times as wide as "
+    "its interval or more: the smaller it is, the easier the equations are learned."
 )
 
 
@@ -39,6 +41,7 @@ def updated_case(
     folder: str | os.PathLike[str],
     commands: str,
     measured: Trajectories | None = None,
+    spread: float = 1.0,
 ) -> str:
     """The text of a case.toml for a twin with identified parameters.
 
@@ -56,6 +59,8 @@ def updated_case(
     measured : Trajectories, optional
         The trajectories in that file; their commands decide about the correction of a twin without
         a case.
+    spread : float, default 1
+        Share of the ranges, about the values, over which `fit_state_surrogate` draws parameters.
 
     Returns
     -------
@@ -91,7 +96,7 @@ def updated_case(
             lines[place_of_tables:place_of_tables] = _correction(measured)
         if not state_names(twin):
             lines += ["", *_comment(STATE_EQUATIONS), "[state_surrogate]"]
-            lines.append(f"sufficient = {SUFFICIENT}")
+            lines += [f"sufficient = {SUFFICIENT}", f"spread = {spread:.2g}"]
     lines += ["", "[parameters]"]
     for each, value in zip(twin.parameters, twin.values, strict=True):
         start = min(max(value, each.low), each.high)

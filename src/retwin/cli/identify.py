@@ -200,10 +200,12 @@ def _opened(
     from retwin.cases import open_parametric
 
     inputs, outputs = names
+    if rate is None and ":" in twin and inputs and outputs:  # a function has no rate of its own
+        rate = reader.rate(logs[0], (*inputs, *outputs))
     opened = open_parametric(twin, free, inputs=inputs, outputs=outputs, rate=rate)
     suffix = Path(twin).suffix.lower()
     if rate is None and suffix in UNRATED:
-        rate = reader.rate(logs[0], opened.twin)
+        rate = reader.rate(logs[0], (*opened.twin.inputs.names, *opened.twin.outputs.names))
     held = opened.twin.outputs.names
     if not outputs and opened.case is None and suffix == ".fmu":
         held = reader.measured_outputs(logs, opened.twin) or held

@@ -20,6 +20,7 @@ from retwin.cases.updated_case import updated_case
 from retwin.data.io import save
 from retwin.errors import InputError
 from retwin.evaluation.identification import Identification
+from retwin.evaluation.identification.parameters import spread_of
 from retwin.report.identification import identification_page
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place
@@ -81,7 +82,14 @@ def save_identification(
     start = start_values(found.twin)
     with write_atomically(folder, folder=True) as part:
         save(logs.trajectories, part / "logs.npz")
-        text = updated_case(opened, found.twin, part, "logs.npz", logs.trajectories)
+        text = updated_case(
+            opened,
+            found.twin,
+            part,
+            "logs.npz",
+            logs.trajectories,
+            spread_of(found.parameters),
+        )
         (part / "updated.toml").write_text(text, encoding="utf-8")
         values["updated_case"] = _refused(part / "updated.toml", found.twin)
         if values["updated_case"]:

@@ -25,6 +25,9 @@ OPEN = 0.8
 WIDEST = 0.5
 """Share of a range that the 95 % interval of an identified parameter covers at most: the
 measurements then halve what was known before."""
+MARGIN, SMALLEST = 5.0, 0.2
+"""Width of what simulations of a state surrogate cover, over that of an interval, since corrected
+dynamics move parameters by more than their errors; and the least share of a range."""
 SMALL = 0.1
 """Least component of a direction that is listed."""
 Basis = Literal["trajectories", "samples", "posterior", "none"]
@@ -91,6 +94,21 @@ class ParameterEstimate:
         return self.interval is not None and not (
             self.low < self.interval[0] and self.interval[1] < self.high
         )
+
+
+def spread_of(parameters: Sequence[ParameterEstimate]) -> float:
+    """Share of the ranges, about the values, that is `MARGIN` times as wide as each interval.
+
+    It is 1 where a parameter is not identified, so that its whole range has to be simulated.
+    """
+    shares = [SMALLEST]
+    for each in parameters:
+        if each.at_bound:
+            continue
+        if not each.identified or each.interval is None:
+            return 1.0
+        shares.append(MARGIN * (each.interval[1] - each.interval[0]) / (each.high - each.low))
+    return min(1.0, max(shares))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import floats
-from retwin.checks import finite, positive, require, whole
+from retwin.checks import apart, finite, positive, require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, refusing, write_model
@@ -26,8 +26,10 @@ from retwin.update.state_surrogate.search import Found, relative_error, searched
 from retwin.update.state_surrogate.simulations import (
     MIN_SIMULATIONS,
     Simulations,
+    beginning_with,
     check_outputs,
     drawn_parameters,
+    first_command,
     samplers_of,
 )
 
@@ -164,7 +166,8 @@ def fit_state_surrogate(
 
     The result is a `StateTwin`: it is differentiable, its parameters can be identified, its
     dynamics corrected (`fit_dynamics`), and its faults inverted. The order is that with the least
-    error of held-out simulations. All simulations of the twin must begin alike.
+    error of held-out simulations. Where the start of a twin depends on its first command, all
+    simulations begin with the same one, and the starts of the surrogate are unknown.
 
     Parameters
     ----------
@@ -202,7 +205,9 @@ def fit_state_surrogate(
     seed, report = checked_seed(seed), progress or (lambda _: None)
     free = drawn_parameters(twin, settings.spread)
     samplers, own = samplers_of(twin, commands, observed)
-    simulations, rng = Simulations(twin, free, samplers), np.random.default_rng(seed)
+    first = first_command(twin, samplers)
+    own = [beginning_with(first, each) for each in own]
+    simulations, rng = Simulations(twin, free, samplers, first), np.random.default_rng(seed)
     training = simulations.made(settings.simulations, rng)
     held_out, test = (simulations.made(settings.simulations // 4, rng) for _ in range(2))
     check_outputs(training)
@@ -218,7 +223,8 @@ def fit_state_surrogate(
         seed=seed,
         progress=lambda share: report(0.2 + 0.7 * share),
     )
-    made = _twin_of(twin, found, free, training, own, unknown_start=settings.unknown_start)
+    unknown = settings.unknown_start or first is not None
+    made = _twin_of(twin, found, free, training, own, unknown_start=unknown)
     figures = {
         "states": float(found.order),
         "hidden": float(len(found.equations.arrays["b"])),
@@ -292,16 +298,18 @@ def _tested(
         for part in (slice(None), slice(tenth), slice(-tenth, None))
     )
     worst, names = int(np.argmax(whole)), made.outputs.names
+    bound, size = apart(allowed, whole[worst])
     require(
         whole[worst] <= allowed,
         "twin",
-        expected=f"simulations that a state surrogate follows to {allowed:.3g} of the standard "
+        expected=f"simulations that a state surrogate follows to {bound} of the standard "
         "deviation of each output",
-        got=f"an error of {whole[worst]:.3g} for {names[worst]} ({first[worst]:.3g} in the first "
+        got=f"an error of {size} for {names[worst]} ({first[worst]:.3g} in the first "
         f"tenth of the samples, {last[worst]:.3g} in the last)",
-        remedy="give more simulations, a wider network, a smaller spread of the parameters, or "
-        "shorter trajectories; chaos, impacts, switches, and a start that depends on the first "
-        "command can hardly be learned: use the twin itself with a correction of its outputs",
+        remedy="give more simulations, a wider network (hidden), a smaller spread of the "
+        "parameters, all under [state_surrogate] of a case, or shorter trajectories; chaos, "
+        "impacts, switches and dead time can hardly be learned: use the twin itself with a "
+        "correction of its outputs",
     )
     columns = {
         "rmse": whole * deviation,
@@ -351,14 +359,16 @@ def _compared(
         what = "the twin's discrepancy there"
     errors, sizes = (relative_error(each, seen, ones) for each in (error, compared))
     worst, names = int(np.argmax(errors - largest * sizes)), made.outputs.names
+    bound, size = apart(largest * sizes[worst], errors[worst])
+    unit = "" if made.outputs.units[worst] == "1" else f" {made.outputs.units[worst]}"
     require(
         errors[worst] <= largest * sizes[worst],
         "commands" if observed is None else "observed",
-        expected=f"an error of the surrogate on these commands of at most {largest:g} of {what}",
-        got=f"{errors[worst]:.3g} with {sizes[worst]:.3g} {made.outputs.units[worst]} for "
-        f"{names[worst]}",
-        remedy="give more simulations, a wider network or a smaller spread of the parameters, so "
-        "that the surrogate is more accurate",
+        expected=f"an error of the surrogate on these commands of at most {bound}{unit} for "
+        f"{names[worst]}, {largest:g} of {what}",
+        got=f"{size}{unit}",
+        remedy="give more simulations, a wider network (hidden) or a smaller spread of the "
+        "parameters under [state_surrogate] of a case, so that the surrogate is more accurate",
     )
     figures = {f"own_{name}": float(each) for name, each in zip(names, errors, strict=True)}
     if observed is None:

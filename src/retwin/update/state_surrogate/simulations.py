@@ -25,6 +25,9 @@ MAX_SAMPLES = 100_000
 """Number of samples of all simulations together, about; more do not lower the error."""
 MIN_SIMULATIONS = 10
 """Least number of simulations to learn from."""
+LATER, LARGER = 200, 3.0
+"""The sample of a later pulse, and the ratio of effects of the first pulse and this one, from which
+the start depends on the first command."""
 FAILED = 0.2
 """Largest share of the simulations that may fail."""
 
@@ -81,6 +84,8 @@ class Simulations:
         What is drawn.
     samplers : sequence of CommandSampler
         Of equal parts of the commands.
+    first : NDArray, optional
+        (d_u,), the first command of all simulations, where their starts depend on it.
     seconds : float
         What a simulated sample takes.
     reason : str
@@ -91,6 +96,7 @@ class Simulations:
     twin: Twin
     parameters: Sequence[Parameter]
     samplers: Sequence[CommandSampler]
+    first: NDArray | None = None
     seconds: float = field(default=0.0, init=False)
     reason: str = field(default="", init=False)
 
@@ -105,7 +111,7 @@ class Simulations:
 
     def _of(self, sampler: CommandSampler, count: int, rng: np.random.Generator) -> Trajectories:
         u = sampler.sample(count, rng=rng).astype(np.float64)
-        u = u[:, : MAX_SAMPLES // MIN_SIMULATIONS]
+        u = beginning_with(self.first, u[:, : MAX_SAMPLES // MIN_SIMULATIONS])
         require(
             u.shape[1] >= MIN_SAMPLES,
             "commands",
@@ -134,6 +140,36 @@ class Simulations:
         units = (each.unit for each in self.parameters)
         inputs = Channels((*made.inputs.names, *names), (*made.inputs.units, *units))
         return made.replace(commands=np.concatenate([made.commands, *held], 2), inputs=inputs)
+
+
+def beginning_with(first: NDArray | None, commands: NDArray) -> NDArray:
+    """Commands (n, T, d_u) with this first sample, if one is given."""
+    if first is None:
+        return commands
+    made = commands.copy()
+    made[:, 0] = first
+    return made
+
+
+def first_command(twin: Twin, samplers: Sequence[CommandSampler]) -> NDArray | None:
+    """A first command (d_u,) for all simulations, if the start of a twin depends on it.
+
+    A twin may begin in equilibrium with its first command. Then a pulse in the first sample has a
+    much larger effect than the same pulse later. None for any other twin.
+    """
+    drawn = samplers[0].sample(8, rng=np.random.default_rng(0)).astype(np.float64)
+    level, other = drawn.mean(axis=(0, 1)), drawn[:, 0].max(axis=0)
+    other = np.where(other > level, other, drawn[:, 0].min(axis=0))
+    later = min(drawn.shape[1], 2 * LATER) // 2
+    u = np.tile(level, (3, 2 * later, 1))
+    u[1, 0] = u[2, later] = other
+    try:
+        made = twin.simulate(u, seed=0).observed.astype(np.float64)
+    except SimulationError:
+        return None
+    at_first, at_later = made[1, :later] - made[0, :later], made[2, later:] - made[0, later:]
+    sizes = [np.sqrt(np.sum(each**2, axis=0)) for each in (at_first, at_later)]
+    return level if (sizes[0] > LARGER * sizes[1]).any() else None
 
 
 def check_outputs(training: Trajectories) -> None:
