@@ -36,7 +36,7 @@ def available() -> int:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One thread of torch and of BLAS, as many as before afterwards: for steps too small to divide."""
+    """One thread of torch and of BLAS in the block: for steps that are too small to divide."""
     import torch
 
     with _lock:

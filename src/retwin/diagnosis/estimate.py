@@ -48,9 +48,10 @@ class Calibration:
         if not self.runs:
             return "nothing is known of how often it calls a healthy trajectory unknown"
         few = self.runs < round(1 / self.false_rate) - 1
+        doubt = ", which so few cannot show" if few else ""
         text = (
             f"the bound of unknown comes from {self.runs} healthy trajectories: "
-            f"{self.false_rate:.2g} of further ones are to be unknown{', which so few cannot show' if few else ''}; of "
+            f"{self.false_rate:.2g} of further ones are to be unknown{doubt}; of "
             f"{self.simulated} that the corrected twin simulates, {self.below} are"
         )
         if self.runs < FEW:

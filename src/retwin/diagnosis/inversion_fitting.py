@@ -144,7 +144,7 @@ def fit_inversion(
     context, observed, mask = given.with_error(variance)[:]
     problem = command_problem(residual, context, observed, mask)
     noise = fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS)
-    seen = healthy.mask.any(axis=0).any(axis=0).tolist()
+    seen: list[bool] = np.any(healthy.mask, axis=(0, 1)).tolist()
     outputs = tuple(compress(healthy.outputs.names, seen))
     limits = (1.0, min(ERRORS, 1 + ERRORS / len(healthy)), ERRORS)
     each, near, far = _explained(residual, noise, (context, observed, mask), limits)
