@@ -296,15 +296,16 @@ class InversionDiagnoser:
         folder = Path(folder)
         surrogate = Surrogate.load(folder / "surrogate")
         faults = {
-            name: None if config is None else from_config(config, FAULTS)
+            name: None if config is None else from_config(config, FAULTS, rate=surrogate.rate)
             for name, config in about["faults"]
         }
         return cls(
             surrogate,
-            ResidualModel.load(folder / "residual"),
+            ResidualModel.load(folder / "residual", surrogate.rate),
             faults,
             noise=Noise(weights["scale"], weights["thinning"]),
-            surrogate_variance=weights["surrogate_variance"],
+            # Development versions before 0.1.0 did not write it.
+            surrogate_variance=weights.get("surrogate_variance"),
             bound=float(weights.get("bound", -np.inf)),
             calibration=from_config(about["calibration"], (Calibration,))
             if "calibration" in about

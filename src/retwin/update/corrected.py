@@ -161,7 +161,7 @@ class CorrectedTwin:
         folder = Path(folder)
         network = kind_of(folder / "surrogate") in ("surrogate", "")
         surrogate: Any = (Surrogate if network else ExactSurrogate).load(folder / "surrogate")
-        residual = load_residual(folder / "residual")
+        residual = load_residual(folder / "residual", surrogate.rate)
         with refusing(folder, expected="a corrected twin"):
             forecast = ForecastErrors.of(about.get("forecast"))
             return cls(surrogate, residual, about["case"], about["random"], forecast)
