@@ -76,6 +76,7 @@ BASE = {
     "diagnose predict": "cnn real.npz",
     "fit": "reach.toml --real real.npz --simulations 20",
     "generate": "model --case reach.toml --per-class 1",
+    "evaluate": "model --real real.npz --case reach.toml",
     "export actuator": "model --torchscript-only",
     "export actuator-net": "model --joint second,far,high",
     "export fmu": "model",

@@ -11,7 +11,10 @@ import typer
 
 from retwin import catalog
 from retwin.checks import given, require
+from retwin.checks import one_of as in_catalog
 from retwin.cli.completion import one_of
+from retwin.cli.dynamics import LARGEST, SIGNIFICANT, fit_equations, white_errors
+from retwin.cli.methods import fit_method, residual_line
 from retwin.cli.options import CaseArgument, Horizon, Json, LogMapping, MaxBytes, Seed, seconds_of
 from retwin.cli.reading import read
 from retwin.cli.terminal import answer, bar, note, table
@@ -96,10 +99,6 @@ Yardstick = Annotated[
         "--yardstick/--no-yardstick", help="Compare with models without the twin, once saved."
     ),
 ]
-LARGEST = 8
-"""Number of terms of the state equations that are printed."""
-METHODS = {"additive": "output", "delay_offset": "delay_offset", "command_space": "segments"}
-"""The candidate that a correction, given by its name, stands for."""
 
 
 def fit(
@@ -129,52 +128,40 @@ def fit(
     the best is taken: the twin as it is, identified parameters, corrected state equations, a
     correction of the outputs. An option that names a method forces it.
     """
-    from retwin.evaluation.choice.stand_in import Simulating, needs_gradient, stand_in
+    from retwin.evaluation.choice.stand_in import Simulating, stand_in
     from retwin.update.residual.fitting import calibrating
 
     holds = ("model.json", "weights.safetensors", "surrogate", "residual", "choice.json")
     check_place(out, folder=True, holds=(*holds, "report.html"))
     seconds = seconds_of("--horizon", horizon)
-    catalog_mode = catalog.SURROGATE_MODES  # checked before the work
-    require(
-        surrogate in catalog_mode,
-        "--surrogate",
-        expected=", ".join(catalog_mode),
-        got=repr(surrogate),
-        remedy="leave it out",
-    )
+    in_catalog("--surrogate", surrogate, catalog.SURROGATE_MODES)
     system = _system(case, network, correction, density, refine)
-    measured = _labelled(system, _measured(system, real, data, max_bytes, mapping))
+    measured = _measured(system, real, data, max_bytes, mapping)
     # The path is absolute, since a model is also used from other folders.
     name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
+    if dynamics:
+        fit_equations(system, measured, out, name, seed, as_json=as_json)
+        return
+    measured = _labelled(system, measured)
     faults = system.faults if calibrate_on == "all" else calibrate_on
     calibrating(measured, faults)  # before a surrogate is trained, which takes minutes
-    settings = _choice(system, correction, seconds, dynamics=dynamics)
-    recorded = None if twin_data is None else read(twin_data, system, max_bytes=max_bytes)
-    given_by_user = twin_data is not None or network is not None
-    if dynamics:
-        twin: Twin = _with_states(system, measured, seed)
-    else:
-        by_gradient = getattr(settings.correction, "resolution", "") == "segment"
-        wanted = given_by_user or system.diagnosed or (by_gradient and needs_gradient(system.twin))
-        how = Simulating(
-            "on" if surrogate == "auto" and wanted else surrogate,
-            system.sampler,
-            system.per_class if simulations is None else simulations,
-            recorded,
-            system.network,
-            system.training,
-            strict=given_by_user or system.diagnosed,
-        )
-        with bar("fit") as show:
-            twin, text = stand_in(
-                system.twin, measured, how, seed=seed, progress=lambda s: show("surrogate", s)
-            )
-        if text:
-            note(text)
-    if calibrate_on == "all":
-        _fit_all(system, twin, measured, name, out, seed, as_json=as_json)
+    named = (network, correction, density, twin_data, simulations)
+    if system.diagnosed or refine or calibrate_on != "healthy" or any(x is not None for x in named):
+        fit_method(
+            system, measured, faults, name, out, twin_data=twin_data, simulations=simulations,
+            max_bytes=max_bytes, seed=seed, as_json=as_json,
+        )  # fmt: skip
         return
+    how = Simulating(
+        surrogate, system.sampler, system.per_class, None, system.network, system.training
+    )
+    with bar("fit") as show:
+        twin, text = stand_in(
+            system.twin, measured, how, seed=seed, progress=lambda s: show("surrogate", s)
+        )
+    if text:
+        note(text)
+    settings = _choice(system, seconds)
     _fit_chosen(
         system, twin, measured, settings, name, out, seed, yardstick=yardstick, as_json=as_json
     )
@@ -195,7 +182,7 @@ def _fit_chosen(
     """Compare, save, compare with models without the twin, and print."""
     import retwin as rt
     from retwin.evaluation.choice.fitting import with_yardstick
-    from retwin.report.choice.page import write_page
+    from retwin.report.choice import fit_page
 
     original = system.twin if isinstance(twin, rt.Surrogate) else None
     with bar("fit") as show:
@@ -208,63 +195,22 @@ def _fit_chosen(
             original=original,
             progress=lambda s: show("candidates", s),
         )
-        found.save(out)
+        found.save(out, page=fit_page(found, str(out), title=system.title))
         if yardstick and not system.diagnosed:
             note(f"Saved {out}; now models without the twin, to be compared with")
             found = with_yardstick(found, seed=seed, progress=lambda s: show("yardstick", s))
-            found.save(out)
-    write_page(found, out / "report.html", title=system.title)
+            found.save(out, page=fit_page(found, str(out), title=system.title))
     _print(found, twin, out, as_json=as_json)
 
 
-def _fit_all(
-    system: Case,
-    twin: Twin,
-    measured: Trajectories,
-    name: str,
-    out: Path,
-    seed: int,
-    *,
-    as_json: bool,
-) -> None:
-    """The correction of the case, calibrated on faulty trajectories too: an ablation."""
-    import retwin as rt
-
-    with bar("fit") as show:
-        residual = rt.fit_residual(
-            twin,
-            measured,
-            system.correction,
-            system.density,
-            seed=seed,
-            calibrate_on=system.faults,
-            twin=system.twin,
-            progress=lambda s: show("residual model", s),
-        )
-    model = rt.CorrectedTwin(twin, residual, case=name)  # type: ignore[arg-type]
-    model.save(out)
-    assert residual.fitted is not None
-    answer(
-        {"saved": str(out), "residual": residual.fitted.figures, "reason": residual.fitted.reason},
-        f"Residual model of all classes: {residual.fitted.reason}.",
-        as_json=as_json,
-    )
-    note(f"Saved {out}")
-
-
-def _choice(
-    system: Case, correction: str | None, horizon: float | None, *, dynamics: bool
-) -> Choice:
-    """The settings of the comparison, by the case and the options."""
+def _choice(system: Case, horizon: float | None) -> Choice:
+    """The settings of the comparison, by the case."""
     import retwin as rt
     from retwin.update.residual import Density as PerSegment
     from retwin.update.residual import SequenceMixture
 
     own, density = system.correction, system.density
-    method = "dynamics" if dynamics else METHODS.get(correction or "", "")
     return rt.Choice(
-        candidates=("none", "delay_offset", "segments") if system.diagnosed else (),
-        method=method,
         horizon=horizon,
         dynamics=system.dynamics,
         correction=own if own.resolution == "segment" else None,
@@ -335,37 +281,11 @@ def _measured(
     return given("--data", system.records, expected, got=got, remedy="give --real FILE")(data)[0]
 
 
-def _with_states(system: Case, measured: Trajectories, seed: int) -> Twin:
-    """The twin of the case, or state equations that stand in for it if it is no `StateTwin`."""
-    from retwin.twins import keep_workers
-    from retwin.update import fit_state_surrogate
-    from retwin.update.dynamics import state_names
-
-    if state_names(system.twin):
-        return system.twin
-    with keep_workers(), bar("fit") as show:
-        found = fit_state_surrogate(
-            system.twin,
-            system.sampler,
-            measured,
-            system.state_surrogate,
-            seed=seed,
-            progress=lambda s: show("state surrogate", s),
-        )
-    errors = (
-        f"{found.figures[f'own_{name}']:.3g} {unit} of {name}"
-        for name, unit in zip(found.twin.outputs.names, found.twin.outputs.units, strict=True)
-    )
-    note(
-        f"The twin shows no state equations. Others with {found.figures['states']:.0f} states "
-        "stand in for it, learned from simulations; on the measured commands their RMS error is "
-        f"{', '.join(errors)}"
-    )
-    return found.twin
-
-
 def _print(found: Fitted, twin: Twin, out: Path, *, as_json: bool) -> None:
     """Print the comparison and what it shows."""
+    import retwin as rt
+    from retwin.update import DynamicsTwin
+
     units = dict(zip(found.records.outputs.names, found.records.outputs.units, strict=True))
     columns = [f"RMSE {name} [{unit}]" for name, unit in units.items()]
     rows = [
@@ -398,6 +318,39 @@ def _print(found: Fitted, twin: Twin, out: Path, *, as_json: bool) -> None:
         ]
         text = "The largest terms of the state equations, over the usual derivative of their state:"
         shown += [text, table(("term", "size"), terms, numbers=("size",)), ""]
+    lines = []
+    if isinstance(found.twin, rt.CorrectedTwin):
+        lines.append(residual_line(found.twin.residual))
+    white = {}
+    if isinstance(found.twin, DynamicsTwin):
+        white = white_errors(found.twin.predictive(found.records))
+        lines += [
+            f"One-step errors of {name} are {'not ' * (each['p'] < SIGNIFICANT)}white noise: the "
+            f"largest autocorrelation is {each['autocorrelation']:.2g} at {each['lag']:.3g} s "
+            f"(95 % limit {each['limit']:.2g}, Ljung and Box p = {each['p']:.2g})."
+            for name, each in white.items()
+        ]
+    surrogate = _surrogate_rows(twin)
+    if surrogate:
+        own = [
+            (e["output"], f"{e['rmse']:.3g} {e['unit']}", f"{e['nrmse']:.2%}") for e in surrogate
+        ]
+        text = "Surrogate on held-out twin trajectories:"
+        shown += [text, table(("output", "RMSE", "NRMSE"), own, numbers=("RMSE", "NRMSE")), ""]
     failed = [f"{each.title}: {each.reason}" for each in found.scores if each.reason]
-    answer({"saved": str(out), **found.values}, *shown, *found.remarks, *failed, as_json=as_json)
+    values = {"saved": str(out), **found.values, "surrogate": surrogate, "one_step_errors": white}
+    answer(values, *shown, *found.remarks, *lines, *failed, as_json=as_json)
     note(f"Saved {out}, with the comparison in {out / 'report.html'}")
+
+
+def _surrogate_rows(twin: Twin) -> list[dict[str, Any]]:
+    """The errors of a surrogate on simulations of the twin that were held out."""
+    import retwin as rt
+
+    if not isinstance(twin, rt.Surrogate) or twin.fitted is None:
+        return []
+    figures, channels = twin.fitted.figures, twin.outputs
+    return [
+        {"output": n, "unit": u, "rmse": figures[f"rmse_{n}"], "nrmse": figures[f"nrmse_{n}"]}
+        for n, u in zip(channels.names, channels.units, strict=True)
+    ]

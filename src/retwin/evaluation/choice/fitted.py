@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.serialisation.files import read_json, write_json
+from retwin.serialisation.files import read_json, write_atomically, write_json
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics import DynamicsTwin, FittedDynamics
 
-FILE = "choice.json"
-"""The comparison, in the folder of the model."""
+FILE, PAGE = "choice.json", "report.html"
+"""The comparison and its page, in the folder of the model."""
 
 
 @dataclass(frozen=True)
@@ -145,10 +145,13 @@ class Fitted:
         fitted = self.twin.residual.fitted
         return {"figures": fitted.figures, "reason": fitted.reason}
 
-    def save(self, folder: str | Path) -> None:
-        """Write the twin as `rt.load_twin` reads it, with the comparison beside it."""
-        self.twin.save(folder)
-        write_json(Path(folder) / FILE, self.values)
+    def save(self, folder: str | Path, *, page: str = "") -> None:
+        """Write the twin as `rt.load_twin` reads it, the comparison, and a page if one is given."""
+        with write_atomically(folder, folder=True) as part:
+            self.twin.save(part)
+            write_json(part / FILE, self.values)
+            if page:
+                (part / PAGE).write_text(page, encoding="utf-8")
 
 
 def _finite(value: Any) -> Any:

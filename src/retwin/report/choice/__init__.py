@@ -4,6 +4,6 @@ Belongs here: its figures and tables. Not here: numbers, which `evaluation.choic
 prose, which is in its template.
 """
 
-from retwin.report.choice.page import write_page
+from retwin.report.choice.page import fit_page
 
-__all__ = ["write_page"]
+__all__ = ["fit_page"]

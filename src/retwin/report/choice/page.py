@@ -1,9 +1,8 @@
-"""`write_page`: one self-contained HTML page about an updated twin."""
+"""`fit_page`: one self-contained HTML page about an updated twin."""
 
 from __future__ import annotations
 
 from math import isfinite
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,14 +16,24 @@ from retwin.report.identification.figures import OUTPUTS, SAMPLES
 from retwin.report.identification.texts import significant
 from retwin.report.labels import counted, duration
 from retwin.report.plotly_specs import figure_specs
-from retwin.serialisation.files import write_atomically
 from retwin.update.forecast_errors import USUAL
 
 MEASURED, PREDICTED = "ink", "c0"
 
 
-def write_page(found: Fitted, path: Path, *, title: str) -> None:
-    """Write the page, which needs no other file and no network."""
+def fit_page(found: Fitted, folder: str, *, title: str) -> str:
+    """The page as text, which needs no other file and no network.
+
+    Parameters
+    ----------
+    found : Fitted
+        What `rt.fit` returned.
+    folder : str
+        The folder of the model, as it was given.
+    title : str
+        The name of the system.
+
+    """
     templates = environment()
     templates.filters |= {"counted": counted, "duration": duration}
     templates.globals |= {
@@ -34,10 +43,10 @@ def write_page(found: Fitted, path: Path, *, title: str) -> None:
     }
     figures = {"predictions": _predictions(found)}
     forecast = found.twin.forecast
-    text = templates.get_template("fit.html.j2").render(
+    return templates.get_template("fit.html.j2").render(
         found=found,
         title=title,
-        folder=str(path.parent),
+        folder=folder,
         taken=found.score(found.chosen),
         parts=", ".join(dict.fromkeys(found.parts)),
         horizon="in free simulation from the commands"
@@ -53,8 +62,6 @@ def write_page(found: Fitted, path: Path, *, title: str) -> None:
         specs=script_json(figure_specs(figures.values())),
         plotly=plotly_js(),
     )
-    with write_atomically(path) as part:
-        part.write_text(text, encoding="utf-8")
 
 
 def _units(found: Fitted) -> dict[str, str]:
