@@ -54,7 +54,7 @@ from retwin.errors import InputError, place_of
 
 __all__ = ["app", "command_tree", "main"]
 
-UNSHOWN = ("quiet", "help", "install_completion", "show_completion")
+UNSHOWN = ("version", "quiet", "help", "install_completion", "show_completion")
 """Options for which the first screen has no line."""
 
 

@@ -53,7 +53,7 @@ def generate(
     workers: Workers = None,
     mapping: LogMapping = None,
 ) -> None:
-    """Generate a balanced labelled set, or predictions of given commands.
+    """Generate trajectories, or predictions of commands.
 
     A *.npz holds one class after the other; a *.zarr holds the classes in turn, with other draws,
     and is resumed after an interruption.
@@ -138,7 +138,7 @@ def evaluate(
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
-    """Score an updated twin on other records, beside the twin, the mean and the last sample."""
+    """Score an updated twin on other records."""
     from retwin.evaluation import predict_records, score_model
 
     ahead = seconds_of("--horizon", horizon)

@@ -48,7 +48,7 @@ def load_twin(folder: str | Path) -> CorrectedTwin | DynamicsTwin:
             remedy = f"fit its twin first: retwin fit {Path(folder) / 'updated.toml'} --real LOG"
         raise InputError(
             str(folder),
-            expected="the folder of an updated twin, with its model.json",
+            expected="the folder of a corrected model, with its model.json",
             got=got,
             remedy=remedy,
         )
