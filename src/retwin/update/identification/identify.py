@@ -238,7 +238,8 @@ def _searched(
             with begin(twin, observed) as misfit:
                 found, stride = _fitted(misfit, method, missing, progress), misfit.stride
         except InputError:
-            if not choice or not lasting(twin, observed):
+            usable = isinstance(observed, Trajectories)
+            if not (choice and usable and lasting(twin, observed)):
                 raise
             stride = 1
         if found is not None:
