@@ -200,3 +200,40 @@ def test_states_that_the_twin_has_not_are_refused_when_the_case_is_read(folder: 
     file.write_text(CASE.replace("folds = 8", 'states = ["nope"]'))
     with pytest.raises(rt.InputError, match=r"dynamics\.states.*one of level, got 'nope'"):
         rt.cases.get(str(file))
+
+
+@pytest.mark.slow
+def test_without_a_method_the_records_decide(folder: Path, tmp_path: Path, call) -> None:
+    case, out = folder / "case.toml", tmp_path / "model"
+    brisk = '[density]\nkind = "SequenceMixture"\nmembers = 2\ntraining = { max_epochs = 2 }\n'
+    case = folder / "brisk.toml"
+    case.write_text(CASE.replace("[records]", 'correction = "additive"\n[records]') + brisk)
+    given = ("--data", folder / "d.csv", "--no-yardstick", "--out", out, "--json")
+    code, printed, err = call("fit", case, *given)
+    assert code == 0, err
+    found = json.loads(printed)
+    assert found["chosen"] == found["preferred"]
+    assert found["chosen"] in ("dynamics", "dynamics_output")
+    scores = {each["name"]: each for each in found["candidates"]}
+    assert {"none", "parameters", "dynamics", "output", "dynamics_output"} <= set(scores)
+    assert scores[found["chosen"]]["rmse"]["level"] < 0.5 * scores["parameters"]["rmse"]["level"]
+    assert json.loads((out / "choice.json").read_text())["chosen"] == found["chosen"]
+    assert (out / "report.html").stat().st_size > 1000
+    records = read_case(case).records
+    assert records is not None
+    rt.save(records(folder / "d.csv")[1], tmp_path / "other.npz")
+    other = tmp_path / "other.npz"
+    code, printed, err = call("evaluate", out, "--real", other, "--horizon", "5s", "--json")
+    assert code == 0, err
+    rows = {each["who"]: each for each in json.loads(printed)["scores"]}
+    assert set(rows) == {"model", "twin", "mean", "hold"}
+    assert rows["model"]["rmse"] < 0.5 * min(rows["twin"]["rmse"], rows["mean"]["rmse"])
+    bands = tmp_path / "bands.csv"
+    code, _, err = call("generate", out, "--commands", other, "--bands", "--out", bands)
+    assert code == 0, err
+    head, first, *_ = bands.read_text().splitlines()
+    assert head == "record,time,level_measured,level_mean,level_q05,level_q95"
+    low, mean, high = (float(first.split(",")[i]) for i in (4, 3, 5))
+    assert low < mean < high
+    code, _, err = call("generate", out, "--bands", "--out", bands)
+    assert (code, "--bands: expected --commands FILE" in err) == (2, True)

@@ -68,6 +68,7 @@ def radiating(heat: float, power: float) -> float:
     return 0.3 * power - 0.08 * heat - 0.03 * heat**2
 
 
+@pytest.mark.slow
 def test_a_right_twin_has_nothing_to_correct() -> None:
     found = rt.fit(twin_of(), records(0, slope=right), rt.Choice(candidates=FAST))
     assert found.chosen == "parameters"
@@ -76,6 +77,7 @@ def test_a_right_twin_has_nothing_to_correct() -> None:
     assert alone == now == pytest.approx(0.3, rel=0.01)
 
 
+@pytest.mark.slow
 def test_what_the_equations_lack_is_learned_and_predicts_another_record() -> None:
     found = rt.fit(twin_of(), records(0, slope=radiating), rt.Choice(candidates=FAST))
     assert found.chosen == found.preferred == "dynamics"
@@ -85,6 +87,7 @@ def test_what_the_equations_lack_is_learned_and_predicts_another_record() -> Non
     assert list(scores) == ["model", "mean", "hold"]
 
 
+@pytest.mark.slow
 def test_bands_hold_what_they_promise_of_other_records() -> None:
     """Over records that were not used, at each time ahead; errors are those of 1200 samples."""
     found = rt.fit(twin_of(), records(0, 1, slope=radiating), rt.Choice(candidates=FAST))
@@ -112,6 +115,7 @@ def test_a_missing_dead_time_is_mentioned_with_its_value() -> None:
     assert known.parameters["dead"][2] == pytest.approx(4.0, abs=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["none", "dynamics"])
 def test_a_saved_model_predicts_the_same(tmp_path: Path, method: str) -> None:
     data = records(0, slope=radiating)

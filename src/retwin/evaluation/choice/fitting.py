@@ -35,8 +35,8 @@ from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.forecast_errors import ForecastErrors
 from retwin.update.forecasts import LEADS, calibrate_forecasts, forecasts, free_moments
 
-BASELINES = ("none", "parameters")
-"""Candidates that correct nothing."""
+FAILURES = (InputError, SimulationError, RuntimeError, ArithmeticError, np.linalg.LinAlgError)
+"""What ends a candidate, and not the comparison: refused records, diverging fits and trainings."""
 
 
 def fit(
@@ -202,7 +202,7 @@ class Trials:
                     raise InputError("records", expected="such records", got="none", remedy="")
                 model = fit()
                 made = predict(model, self.whole.records, fold, self.whole.settings.horizon)
-        except (InputError, SimulationError) as error:
+        except FAILURES as error:
             self.reasons[name] = str(error)
             return
         finally:
@@ -294,7 +294,7 @@ def with_yardstick(found: Fitted, *, seed: int = 0, progress: Progress | None = 
                     model = fit_black_box(fold.training(records), kind, seed=seed).twin
                     predicted[kind].append(predict(model, records, fold, found.horizon))
                     report((i + (j + 1) / len(folds)) / len(BLACK_BOXES))
-        except (InputError, SimulationError) as error:
+        except FAILURES as error:
             reasons[kind] = str(error)
             del predicted[kind]
         seconds[kind] = time.process_time() - since
