@@ -98,7 +98,7 @@ def test_what_the_bundle_was_not_made_for(folder: Path, model: Path) -> None:
         values = [each["probability"], *each["probabilities"].values()]
         if each["guard"] == "outside":
             assert each["because_of"]
-            assert each["diagnosis"] == ""
+            assert each["diagnosis"] == "unknown"
             assert values == [None] * (1 + len(classes))
             assert [row[name] for name in classes] == [""] * len(classes)
         else:
