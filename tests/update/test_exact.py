@@ -78,7 +78,7 @@ def test_finite_differences_are_a_warning_on_cost(measured: rt.Trajectories) -> 
 def test_what_needs_a_surrogate_is_refused(measured: rt.Trajectories, tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="DelayOffset cannot express what was measured"):
         residual = rt.fit_residual(TWIN, measured, rt.DelayOffset(), BRIEF, seed=0)
-    with pytest.raises(rt.InputError, match="fit one with fit_surrogate"):
+    with pytest.raises(rt.InputError, match="can be opened again"):
         rt.CorrectedTwin(TWIN, residual).save(tmp_path / "twin")
     assert not (tmp_path / "twin").exists()
     with pytest.raises(rt.InputError, match=r"surrogate: expected a surrogate, or a twin"):
@@ -108,7 +108,7 @@ def test_a_twin_is_inverted_and_its_diagnoser_is_not_saved(
         found = [diagnoser.predict_proba(each[:2])[:, 1] for each in (measured, biased)]
     assert (found[0] < 0.5).all()
     assert (found[1] > 0.5).all()
-    with pytest.raises(rt.InputError, match="fit one with fit_surrogate"):
+    with pytest.raises(rt.InputError, match="can be opened again"):
         diagnoser.save(tmp_path / "d")
     assert not (tmp_path / "d").exists()
 
