@@ -146,12 +146,16 @@ def pooled(entries: list[dict[str, Any]]) -> dict[str, Any]:
     return {**roots, **means, "seconds": seconds, "note": "; ".join(notes)}
 
 
+def number(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.3g}"
+
+
 def rmse(scores: Mapping[str, Any]) -> str:
-    return f"{scores['rmse']:.3g}"
+    return number(scores["rmse"])
 
 
 def crps(scores: Mapping[str, Any]) -> str:
-    return f"{scores['crps']:.3g}"
+    return number(scores["crps"])
 
 
 def bands(scores: Mapping[str, Any]) -> str:
@@ -222,7 +226,7 @@ def main() -> None:
         run(names, options)
     rows = gathered(names, options.data, options.out)
     show(rows)
-    if not options.names:
+    if not options.names and not options.show:
         result = {"machine": machine(), "rows": rows}
         write(HERE / "results" / "systems.json", result)
 

@@ -72,3 +72,13 @@ def test_the_table_pools_squares_of_folds(modules, monkeypatch):
         "3.54",
         "|",
     ]
+
+
+def test_the_last_value_is_the_first_one_that_is_scored_where_none_is_before(modules):
+    _, cart, methods = modules
+    position = np.arange(50.0) ** 2
+    position[:5] = np.nan
+    record = cart.trajectory(cart.CART, np.zeros(50), position)
+    system = replace(cart.cart(Path()), calibration=record, scale=1.0, horizon=None, warm_up=0.0)
+    found = methods.score(methods.Constant(system, hold=True), system, record)
+    assert found["rmse"] == pytest.approx(np.sqrt(np.mean((position[5:] - position[5]) ** 2)))

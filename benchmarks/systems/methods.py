@@ -163,9 +163,9 @@ def scores(
         measured = np.where(record.mask, record.observed, np.nan)[0]
         outputs = np.broadcast_to(model.mean, measured.shape)[first:]
         if model.hold:
-            outputs = (
-                measured[first - samples : -samples] if samples else measured[max(0, warm - 1)]
-            )
+            seen = np.flatnonzero(np.isfinite(measured).all(axis=1))
+            last = measured[seen[seen < max(warm, seen[0] + 1)][-1]]
+            outputs = measured[first - samples : -samples] if samples else last
         error = np.abs(measured[first:] - outputs)
         none = np.full(error.shape[1], np.nan)
         return np.stack([np.nanmean(error**2, 0), np.nanmean(error, 0), none, none], 1)
