@@ -21,10 +21,10 @@ from retwin.scores.intervals import MIN_GROUPS, jackknife_interval
 from retwin.scores.residuals import decorrelated_after
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import checked_stride
+from retwin.update.dynamics.windows import simulated as simulated_outputs
 from retwin.update.identification.horizon import predictions
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.posterior import Posterior
-from retwin.update.identification.windows import simulated as simulated_outputs
 
 BEGIN = 10
 """The begin of a trajectory is its part by this number."""

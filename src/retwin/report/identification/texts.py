@@ -7,8 +7,8 @@ from math import floor, isfinite, isnan, log10
 
 from retwin.evaluation.identification import Direction, Identification, ParameterEstimate, RMSError
 from retwin.evaluation.identification.parameters import WIDEST
+from retwin.update.dynamics.windows import state_based
 from retwin.update.identification.posterior import Posterior
-from retwin.update.identification.windows import state_based
 
 WHITE = 0.01
 """p-value below which a residual is not taken for white noise, or depends on an input."""

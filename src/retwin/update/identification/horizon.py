@@ -12,7 +12,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
 from retwin.twins.parametric import ParametricTwin
-from retwin.update.identification.windows import sampled, state_based, windows_of
+from retwin.update.dynamics.windows import sampled, state_based, windows_of
 
 FOLDS = 4
 """Parts of the record that are left out in turn."""

@@ -20,6 +20,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
+from retwin.update.dynamics.windows import state_based
 from retwin.update.identification.bayes import infer_posterior
 from retwin.update.identification.horizon import Candidate, choose_length, lasting
 from retwin.update.identification.identifiability import (
@@ -42,7 +43,6 @@ from retwin.update.identification.search import (
     Optimum,
     Search,
 )
-from retwin.update.identification.windows import state_based
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from retwin.twins.collected import SimulationError
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.step_error import StepWarning
 from retwin.twins.twin import checked_seed, checked_stride
-from retwin.update.identification.windows import Windows, sampled, state_based, windows_of
+from retwin.update.dynamics.windows import Windows, sampled, state_based, windows_of
 
 
 class Misfit:
