@@ -197,7 +197,7 @@ def windows_of(
     length: int | None,
     used: NDArray,
     *,
-    ahead: bool = False,
+    warm: int = 0,
 ) -> Windows | None:
     """Windows of a number of samples, or whole records, in which unstated starts are estimated.
 
@@ -207,10 +207,10 @@ def windows_of(
         See `Windows`.
     length : int or None
         Samples of a window; None for whole records.
-    ahead : bool, default False
-        Whether the starts are estimated by the first half of each window alone, so that its second
-        half is a prediction. Windows that are not whole are left out, and the first one begins
-        where the trajectory was first measured.
+    warm : int, default 0
+        Samples at the begin of each window by which alone its starts are estimated, so that the
+        others are predictions; 0 for all. With it, windows that are not whole are left out, and the
+        first one begins where the trajectory was first measured.
 
     Returns
     -------
@@ -230,15 +230,15 @@ def windows_of(
     rows, first = [], []
     for row in np.flatnonzero(seen.any(axis=1)):
         places = np.flatnonzero(seen[row])
-        begin, end = (int(places[0]), int(places[-1]) + 1) if ahead else (0, int(places[-1]) + 1)
-        begins = np.arange(begin, end - size + 1 if ahead else end, size)
+        begin, end = int(places[0]) if warm else 0, int(places[-1]) + 1
+        begins = np.arange(begin, end - size + 1 if warm else end, size)
         rows += [row] * len(begins)
         first += begins.tolist()
     made_rows, made_first = np.array(rows, dtype=int), np.array(first, dtype=int)
-    if ahead:
+    if warm:
         used = used.copy()
         for row, begin in zip(rows, first, strict=True):
-            used[row, begin + size // 2 : begin + size] = False
+            used[row, begin + warm : begin + size] = False
     # A window without measurements has no start.
     kept = [used[r, f : f + size].any() for r, f in zip(rows, first, strict=True)]
     alike = len(set(observed.outputs.units)) == 1

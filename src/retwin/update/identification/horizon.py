@@ -94,8 +94,9 @@ def choose_length(observed: Trajectories, fit: Fit, stride: int, *, whole: bool)
     """The candidates, the chosen one first.
 
     Each is fitted without a part of the record in turn, and predicts windows of that part from
-    their first halves. It is chosen whose errors are the smallest in the geometric mean over the
-    same horizons for all; whole records are preferred to windows within one standard error.
+    their first halves, and the part as a whole from the samples before it. It is chosen whose
+    errors are the smallest in the geometric mean over the same horizons for all; whole records are
+    preferred to windows within one standard error.
     Horizons over which nothing predicts better than the mean of the record do not count: there
     the disturbances decide, and under feedback the commands reveal these.
 
@@ -117,19 +118,27 @@ def choose_length(observed: Trajectories, fit: Fit, stride: int, *, whole: bool)
         return [Candidate(each, 1.0, 0.0) for each in lengths[:1]]
     spread = np.nanstd(np.where(observed.mask, observed.observed, np.nan), axis=(0, 1))
     spread = np.where(spread > 0, spread, 1.0)
-    logs = np.full((len(lengths), FOLDS, len(horizons)), np.nan)
+    logs = np.full((len(lengths), FOLDS, 1 + len(horizons)), np.nan)
+    scale, warm = (stride, spread), horizons[0]
     for k, part in enumerate(_parts(observed)):
         rest = observed.replace(mask=observed.mask & ~part[..., None])
         left = observed.replace(mask=observed.mask & part[..., None])
+        before = part | np.pad(part[:, warm:], ((0, 0), (0, warm)))
+        longer = observed.replace(mask=observed.mask & before[..., None])
+        seen = longer.mask.any(axis=2).sum(axis=1)
+        longest = int(seen[seen > 0].min(initial=observed.steps)) - warm
         for i, length in enumerate(lengths):
             try:
                 twin = fit(rest, length)
             except InputError:  # a simulation of the whole record fails
                 continue
-            logs[i, k] = [_error(twin, left, each, stride, spread) for each in horizons]
-    with np.errstate(invalid="ignore"):
-        best = np.nanmin(np.where(np.isfinite(logs), logs, np.inf), axis=0).mean(axis=0)
-    useful = best < 0
+            logs[i, k] = [
+                _error(twin, longer, longest, scale, warm=warm),
+                *(_error(twin, left, each, scale) for each in horizons),
+            ]
+    best = np.where(np.isfinite(logs), logs, np.inf).min(axis=0)
+    known = np.isfinite(best)
+    useful = np.where(known, best, 0.0).sum(axis=0) < 0
     return _ranked(lengths, logs[..., useful] if useful.any() else logs[..., -1:])
 
 
@@ -169,13 +178,19 @@ def _parts(observed: Trajectories) -> Iterator[NDArray]:
 
 
 def _error(
-    twin: ParametricTwin, left: Trajectories, horizon: int, stride: int, spread: NDArray
+    twin: ParametricTwin,
+    left: Trajectories,
+    horizon: int,
+    scale: tuple[int, NDArray],
+    *,
+    warm: int | None = None,
 ) -> float:
     """Logarithm of the RMS error over a horizon, in standard deviations of the outputs.
 
     NaN where nothing is measured.
     """
-    error, seen = predictions(twin, left, horizon, stride)
+    stride, spread = scale
+    error, seen = predictions(twin, left, horizon, stride, warm=warm)
     count = seen.sum(axis=(0, 1))
     if not count.all():
         return float("nan")
@@ -185,9 +200,14 @@ def _error(
 
 
 def predictions(
-    twin: ParametricTwin, measured: Trajectories, horizon: int, stride: int = 1
+    twin: ParametricTwin,
+    measured: Trajectories,
+    horizon: int,
+    stride: int = 1,
+    *,
+    warm: int | None = None,
 ) -> tuple[NDArray, NDArray]:
-    """Errors of predictions over a horizon, from as many samples before it.
+    """Errors of predictions over a horizon, from samples before it.
 
     Parameters
     ----------
@@ -196,9 +216,11 @@ def predictions(
     measured : Trajectories
         The measurements.
     horizon : int
-        Samples that are predicted from the starts that the same number of samples before gave.
+        Samples that are predicted from the starts that samples before gave.
     stride : int
         Every how many samples the sensor measures.
+    warm : int, optional
+        The samples before; by default as many as are predicted.
 
     Returns
     -------
@@ -209,7 +231,8 @@ def predictions(
 
     """
     used = sampled(measured.mask, stride)
-    windows = windows_of(twin, measured, 2 * horizon, used, ahead=True)
+    warm = horizon if warm is None else warm
+    windows = windows_of(twin, measured, warm + horizon, used, warm=warm)
     assert windows is not None
     if not len(windows.rows):
         return np.zeros(used.shape), np.zeros(used.shape, dtype=bool)
