@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 import retwin as rt
 from retwin.evaluation import predict_records
 from retwin.evaluation.choice.comparison import Comparison, Predicted
+from retwin.evaluation.choice.fitting import with_yardstick
 from retwin.evaluation.choice.folds import Fold, block_means, folds_of
+from retwin.report.choice import fit_page
 from retwin.twins import State, StateTwin
 from retwin.update import StationaryNoise, free_moments
+from retwin.update.blackbox import BLACK_BOXES
 
 INPUTS, OUTPUTS = rt.Channels(("power",), ("W",)), rt.Channels(("heat",), ("K",))
 FAST = ("none", "parameters", "dynamics")
@@ -97,6 +100,24 @@ def test_bands_hold_what_they_promise_of_other_records() -> None:
         (own, *_) = rt.score_model(found.twin, others, horizon=horizon, warm_up=5.0)
         assert 0.8 <= own.coverage <= 0.98, horizon
         assert own.width < 1.6 * 3.29 * own.rmse
+
+
+@pytest.mark.slow
+def test_models_without_the_twin_are_compared_on_the_same_parts(tmp_path: Path) -> None:
+    data = records(0, slope=radiating)
+    twin = rt.FunctionTwin(lambda u: 3.0 * u, INPUTS, OUTPUTS, 1.0)
+    settings = rt.Choice(candidates=("none",), yardstick=True)
+    found = rt.fit(twin, data, settings)
+    rivals = {each.name: each for each in found.scores if not each.uses_twin}
+    assert set(rivals) == set(BLACK_BOXES)
+    # A twin without a state lacks the memory of the machine, which the commands determine.
+    assert rivals["narx"].rmse["heat"] < 0.2 * found.score("none").rmse["heat"]
+    assert rivals["narx"].difference < -2 * rivals["narx"].standard_error
+    assert any("the twin lacks something" in each for each in found.remarks)
+    page = fit_page(found, "model", title="heater")
+    assert page.count("without the twin") > len(rivals)
+    known = rt.fit(twin_of(), records(0, slope=right), rt.Choice(candidates=FAST))
+    assert not any("lacks something" in each for each in with_yardstick(known).remarks)
 
 
 def test_a_wrong_sign_is_mentioned() -> None:

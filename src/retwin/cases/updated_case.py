@@ -116,15 +116,15 @@ def _correction(measured: Trajectories) -> list[str]:
     ramps = (segments.settle - segments.start)[segments.valid]
     if moves_and_rests(segments) and np.median(ramps) > STEP:
         text = (
-            "The commands of the logs move in ramps and rest: retwin fit learns a delay and an "
-            "offset per segment."
+            "The commands of the logs move in ramps and rest: a correction of the outputs has a "
+            "delay and an offset per segment. retwin fit compares it with others."
         )
         return [*_comment(text), 'correction = "delay_offset"']
     kind = "change in steps" if moves_and_rests(segments) else "change all the time"
     text = (
-        f"The commands of the logs {kind}: retwin fit learns a residual of each sample of the "
-        "outputs. With --dynamics it corrects the state equations, which predict other commands "
-        "better and leave an FMU as another one."
+        f"The commands of the logs {kind}: a correction of the outputs has a residual of each "
+        "sample. retwin fit compares it with others; --dynamics corrects the state equations, "
+        "which leave an FMU as another one."
     )
     return [*_comment(text), 'correction = "additive"']
 

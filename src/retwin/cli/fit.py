@@ -126,7 +126,8 @@ def fit(
 
     Candidates are compared on parts of the records that are left out in turn, and the simplest of
     the best is taken: the twin as it is, identified parameters, corrected state equations, a
-    correction of the outputs. An option that names a method forces it.
+    correction of the outputs. An option that names a method forces it, without a comparison; so
+    does a case with classes.
     """
     from retwin.evaluation.choice.stand_in import Simulating, stand_in
     from retwin.update.residual.fitting import calibrating
@@ -136,6 +137,16 @@ def fit(
     seconds = seconds_of("--horizon", horizon)
     in_catalog("--surrogate", surrogate, catalog.SURROGATE_MODES)
     system = _system(case, network, correction, density, refine)
+    named = (network, correction, density, twin_data, simulations)
+    forced = dynamics or refine or calibrate_on != "healthy" or any(x is not None for x in named)
+    compared = not (forced or system.diagnosed)
+    require(
+        compared or (horizon == "free" and surrogate == "auto"),
+        "--horizon, --surrogate",
+        expected="neither where a method is named, or the case has classes: nothing is compared",
+        got=f"--horizon {horizon}, --surrogate {surrogate}",
+        remedy="leave them out, or the options that name a method",
+    )
     measured = _measured(system, real, data, max_bytes, mapping)
     # The path is absolute, since a model is also used from other folders.
     name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
@@ -145,16 +156,13 @@ def fit(
     measured = _labelled(system, measured)
     faults = system.faults if calibrate_on == "all" else calibrate_on
     calibrating(measured, faults)  # before a surrogate is trained, which takes minutes
-    named = (network, correction, density, twin_data, simulations)
-    if system.diagnosed or refine or calibrate_on != "healthy" or any(x is not None for x in named):
+    if not compared:
         fit_method(
             system, measured, faults, name, out, twin_data=twin_data, simulations=simulations,
             max_bytes=max_bytes, seed=seed, as_json=as_json,
         )  # fmt: skip
         return
-    how = Simulating(
-        surrogate, system.sampler, system.per_class, None, system.network, system.training
-    )
+    how = Simulating(surrogate, system.sampler, system.per_class, system.network, system.training)
     with bar("fit") as show:
         twin, text = stand_in(
             system.twin, measured, how, seed=seed, progress=lambda s: show("surrogate", s)
@@ -196,7 +204,7 @@ def _fit_chosen(
             progress=lambda s: show("candidates", s),
         )
         found.save(out, page=fit_page(found, str(out), title=system.title))
-        if yardstick and not system.diagnosed:
+        if yardstick:
             note(f"Saved {out}; now models without the twin, to be compared with")
             found = with_yardstick(found, seed=seed, progress=lambda s: show("yardstick", s))
             found.save(out, page=fit_page(found, str(out), title=system.title))

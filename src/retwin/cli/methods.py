@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from retwin.cli.reading import read
 from retwin.cli.terminal import answer, bar, note, table
-from retwin.data.trajectories import HEALTHY, Trajectories
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
+    from retwin.data.trajectories import Trajectories
     from retwin.twins.faults import Fault
-    from retwin.twins.samplers import CommandSampler
     from retwin.update.residual import Residual
     from retwin.update.surrogate import Surrogate
 
@@ -34,10 +32,17 @@ def fit_method(
 ) -> None:
     """Fit surrogate and residual model of the case; save the corrected twin."""
     import retwin as rt
+    from retwin.evaluation.choice.stand_in import Simulating, simulations_for
 
-    size = system.per_class if simulations is None else simulations
     if twin_data is None:
-        nominal = _simulated(system, size, seed, measured)
+        size = system.per_class if simulations is None else simulations
+        how = Simulating(sampler=system.sampler, simulations=size)
+        with bar("simulate") as show:
+            nominal, text = simulations_for(
+                system.twin, measured, how, seed, lambda share: show("", share)
+            )
+        if text:
+            note(text)
     else:
         nominal = read(twin_data, system, max_bytes=max_bytes)
     with bar("fit") as show:
@@ -60,42 +65,6 @@ def fit_method(
         )
     rt.CorrectedTwin(ibg, rg, case=name).save(out)
     _print_fit(ibg, rg, out, as_json=as_json)
-
-
-def _simulated(system: Case, simulations: int, seed: int, measured: Trajectories) -> Trajectories:
-    """Healthy simulations of the case's twin, which contain what the real commands contain.
-
-    Where the sampler of the case does not draw such commands, half as many are added that are like
-    the real ones, and as many parts of these.
-    """
-    import retwin as rt
-    from retwin.twins.command_range import CommandRange
-    from retwin.twins.samplers import RecordedSampler
-
-    def drawn(sampler: CommandSampler, count: int) -> Trajectories:
-        healthy = replace(system, faults={HEALTHY: None}, sampler=sampler)
-        with bar("simulate") as show:
-            return rt.generate(
-                system.twin, healthy, per_class=count, seed=seed, progress=lambda s: show("", s)
-            )
-
-    made = drawn(system.sampler, simulations)
-    real, rate, inputs = measured.commands, measured.rate, system.inputs
-    if (measured.inputs, rate) != (inputs, system.rate):
-        return made
-    outside = CommandRange.of(made.commands, rate).outside(real, rate, inputs)
-    if not outside:
-        return made
-    similar = rt.twins.sampler_from(real, rate, limits=getattr(system.twin, "limits", None))
-    duration = min(similar.duration, real.shape[1] / rate)
-    count = max(1, simulations // 2)
-    added = [drawn(each, count) for each in (similar, RecordedSampler(real, rate, duration))]
-    note(
-        f"The sampler of the case does not draw the real commands: {outside}. {2 * count} "
-        "simulations of commands like these were added"
-    )
-    steps = max(each.steps for each in (made, *added))
-    return Trajectories.concatenate([each.padded(steps) for each in (made, *added)])
 
 
 def _print_fit(ibg: Surrogate, rg: Residual, out: Path, *, as_json: bool) -> None:

@@ -36,7 +36,7 @@ from retwin.threads import one_thread
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.twin import Twin
 from retwin.update.corrections.missed_segments import CommandFit
-from retwin.update.exact import exact_surrogate
+from retwin.update.exact import exact_surrogate, load_surrogate
 from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
 from retwin.update.training_range import outside_training
@@ -294,7 +294,7 @@ class InversionDiagnoser:
         """Read what `save` wrote; InputError when it is not an inversion or damaged."""
         about, weights = read_model(folder, "inversion")
         folder = Path(folder)
-        surrogate = Surrogate.load(folder / "surrogate")
+        surrogate = load_surrogate(folder / "surrogate")
         faults = {
             name: None if config is None else from_config(config, FAULTS, rate=surrogate.rate)
             for name, config in about["faults"]

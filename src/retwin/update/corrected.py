@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from retwin.checks import whole
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
-from retwin.serialisation.models import kind_of, read_about, refusing, write_model
+from retwin.serialisation.models import read_about, refusing, write_model
 from retwin.serialisation.sizes import Budget
 from retwin.twins.faults import Fault
 from retwin.twins.system import System
@@ -26,7 +26,7 @@ from retwin.twins.twin import (
     simulate_in_chunks,
 )
 from retwin.update.corrections import measuring
-from retwin.update.exact import ExactSurrogate, exact_surrogate
+from retwin.update.exact import ExactSurrogate, exact_surrogate, load_surrogate
 from retwin.update.forecast_errors import ForecastErrors
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
@@ -159,8 +159,7 @@ class CorrectedTwin:
         """
         about = read_about(folder, "corrected")
         folder = Path(folder)
-        network = kind_of(folder / "surrogate") in ("surrogate", "")
-        surrogate: Any = (Surrogate if network else ExactSurrogate).load(folder / "surrogate")
+        surrogate = load_surrogate(folder / "surrogate")
         residual = load_residual(folder / "residual", surrogate.rate)
         with refusing(folder, expected="a corrected twin"):
             forecast = ForecastErrors.of(about.get("forecast"))

@@ -132,6 +132,16 @@ class ExactSurrogate(OfTwin):
         return cls(parametric.with_values(values), differences=False)
 
 
+def load_surrogate(folder: str | Path) -> Surrogate:
+    """The surrogate in a folder, or the twin that was saved in place of one.
+
+    Raises InputError as `Surrogate.load` and `ExactSurrogate.load` do.
+    """
+    if kind_of(folder) in (KIND, DynamicsTwin.kind):
+        return ExactSurrogate.load(folder)  # type: ignore[return-value]  # it has what is used
+    return Surrogate.load(folder)
+
+
 def require_parameters(parametric: ParametricTwin | None, case: str) -> ParametricTwin:
     """The twin of a case with its parameters.
 

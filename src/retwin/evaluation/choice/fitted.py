@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.serialisation.files import read_json, write_atomically, write_json
+from retwin.serialisation.files import write_atomically, write_json
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics import DynamicsTwin, FittedDynamics
 
@@ -34,7 +34,8 @@ class CandidateScore:
     crps : float
         In standard deviations of the outputs, averaged over blocks.
     difference, standard_error : float
-        Of `crps` from that of the best candidate, over blocks.
+        Of `crps` from that of the best candidate, over blocks; of a model without the twin, from
+        that of the chosen one over the parts in time.
     coverage : float
         Share of samples inside 90 % bands that other parts calibrated.
     seconds : float
@@ -157,9 +158,3 @@ class Fitted:
 def _finite(value: Any) -> Any:
     """A value for JSON, which has neither NaN nor infinity."""
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def read_choice(folder: str | Path) -> dict[str, Any] | None:
-    """The comparison in the folder of a model; None where there is none."""
-    file = Path(folder) / FILE
-    return read_json(file) if file.is_file() else None

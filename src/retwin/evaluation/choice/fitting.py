@@ -19,10 +19,11 @@ from retwin.errors import InputError
 from retwin.evaluation.choice.candidates import Candidates, Model
 from retwin.evaluation.choice.comparison import Comparison, Predicted, predict
 from retwin.evaluation.choice.fitted import CandidateScore, Fitted
-from retwin.evaluation.choice.folds import Fold, folds_of
+from retwin.evaluation.choice.folds import Fold, block_length, block_means, folds_of
 from retwin.evaluation.choice.remarks import remarks_of, without_twin
 from retwin.evaluation.choice.settings import Choice
 from retwin.progress import Progress
+from retwin.scores.distributions import crps_normal
 from retwin.threads import one_thread
 from retwin.twins.collected import SimulationError
 from retwin.twins.parametric import ParametricTwin
@@ -303,8 +304,10 @@ def with_yardstick(found: Fitted, *, seed: int = 0, progress: Progress | None = 
     for kind in BLACK_BOXES:
         if kind in predicted and comparison.diverged(kind):
             reasons[kind] = "its simulation diverges"
-        nothing = {kind: (float("nan"), float("nan"))}
-        row = _row(kind, comparison, nothing, seconds[kind], reasons.get(kind, ""))
+        behind = {kind: (float("nan"), float("nan"))}
+        if kind in predicted and kind not in reasons:
+            behind[kind] = _behind(found, comparison, kind)
+        row = _row(kind, comparison, behind, seconds[kind], reasons.get(kind, ""))
         rows.append(replace(row, uses_twin=False))
     own = [each for each in found.scores if each.uses_twin]
     return replace(
@@ -313,6 +316,25 @@ def with_yardstick(found: Fitted, *, seed: int = 0, progress: Progress | None = 
         remarks=(*found.remarks, *without_twin(rows, found.score(found.chosen))),
         seconds=found.seconds + time.perf_counter() - began,
     )
+
+
+def _behind(found: Fitted, comparison: Comparison, kind: str) -> tuple[float, float]:
+    """Mean difference of a model's scores from those of what was chosen, and its standard error.
+
+    They are those of the parts in time, in standard deviations of the outputs.
+    """
+    scores = []
+    for mean, deviation in (_shown(comparison, kind), (found.predicted, found.deviation)):
+        error = np.where(found.records.mask, found.records.observed - mean, np.nan)
+        each = crps_normal(error, np.zeros_like(error), deviation) / comparison.spread
+        scores.append(np.mean(each, axis=2))
+    change = scores[0] - scores[1]
+    seen = np.isfinite(change)
+    if not seen.any():
+        return float("nan"), float("nan")
+    own = block_means(change, block_length(np.nan_to_num(change), seen))
+    chance = own.std(ddof=1) / np.sqrt(len(own)) if len(own) > 1 else float("inf")
+    return float(own.mean()), float(chance)
 
 
 def _scores(

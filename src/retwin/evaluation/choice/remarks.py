@@ -16,6 +16,8 @@ EXPLAINED = 0.2
 """Share of the mean square error of the twin from which on a dead time is mentioned."""
 LONGEST = 0.1
 """Longest dead time that is tried, over the length of a record."""
+CLEAR = 2.0
+"""Standard errors of the difference of scores that are no chance."""
 BETTER = 0.1
 """Share by which a model without the twin must be better to be mentioned."""
 
@@ -119,7 +121,9 @@ def _dead_time(y: NDArray, x: NDArray) -> tuple[float, float]:
 
 def without_twin(scores: Sequence[CandidateScore], chosen: CandidateScore) -> list[str]:
     """A model without the twin that is better than the chosen candidate, in a sentence."""
-    rivals = [each for each in scores if each.rmse]
+    rivals = [
+        each for each in scores if each.rmse and -each.difference > CLEAR * each.standard_error
+    ]
     if not rivals:
         return []
     best = min(rivals, key=lambda each: each.nrmse)

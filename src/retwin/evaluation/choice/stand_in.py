@@ -47,24 +47,18 @@ class Simulating:
         The distribution of commands; by default like those of the records.
     simulations : int
         Number of simulations.
-    recorded : Trajectories, optional
-        Simulations of the twin that are there already.
     network : Network
         The network that is tried first.
     training : Training, optional
         Its training; by default that of the network.
-    strict : bool
-        Whether only that network is tried.
 
     """
 
     mode: str = "auto"
     sampler: CommandSampler | None = None
     simulations: int = 400
-    recorded: Trajectories | None = None
     network: Network = MLP()  # noqa: RUF009 - frozen
     training: Training | None = None
-    strict: bool = False
 
     def __post_init__(self) -> None:
         one_of("surrogate", self.mode, SURROGATE_MODES)
@@ -114,10 +108,8 @@ def stand_in(
         if taken < SLOW:
             return twin, ""
     report = progress or (lambda _: None)
-    made, text = settings.recorded, ""
-    if made is None:
-        made, text = simulations_for(twin, records, settings, seed, lambda s: report(0.5 * s))
-    networks = [settings.network, *([] if settings.strict else OTHERS)]
+    made, text = simulations_for(twin, records, settings, seed, lambda s: report(0.5 * s))
+    networks = [settings.network, *OTHERS]
     failures = []
     for i, network in enumerate(networks):
         training = settings.training if i == 0 else None
@@ -193,36 +185,32 @@ def simulations_for(
         The simulations, and what was added, in a sentence.
 
     """
-    real, rate = records.commands, records.rate
-    limits = getattr(twin, "limits", None)
-    similar = sampler_from(real, rate, limits=limits)
-    duration = min(similar.duration, real.shape[1] / rate)
-    parts: Sequence[CommandSampler] = (similar, RecordedSampler(real, rate, duration))
+    half = max(1, settings.simulations // 2)
 
     def drawn(sampler: CommandSampler, count: int) -> Trajectories:
-        system = _Healthy(sampler)
-        return generate(twin, system, per_class=count, seed=seed, progress=progress)
+        return generate(twin, _Healthy(sampler), per_class=count, seed=seed, progress=progress)
 
-    half = max(1, settings.simulations // 2)
-    if settings.sampler is None:
-        return _together([drawn(each, half) for each in parts]), ""
-    made = drawn(settings.sampler, settings.simulations)
-    outside = CommandRange.of(made.commands, rate).outside(real, rate, twin.inputs)
-    if not outside:
-        return made, ""
+    made, outside = [], ""
+    if settings.sampler is not None:
+        own = drawn(settings.sampler, settings.simulations)
+        contained = CommandRange.of(own.commands, own.rate)
+        alike = (records.inputs, records.rate) == (twin.inputs, twin.rate)
+        outside = contained.outside(records.commands, own.rate, twin.inputs) if alike else ""
+        if not outside:
+            return own, ""
+        made.append(own)
+    similar = sampler_from(records.commands, records.rate, limits=getattr(twin, "limits", None))
+    duration = min(similar.duration, records.steps / records.rate)
+    parts = RecordedSampler(records.commands, records.rate, duration)
+    made += [drawn(each, half) for each in (similar, parts)]
     text = (
         f"The sampler of the case does not draw the real commands: {outside}. {2 * half} "
         "simulations of commands like these were added"
     )
-    return _together([made, *(drawn(each, half) for each in parts)]), text
+    return _together(made), text if outside else ""
 
 
 def _together(sets: Sequence[Trajectories]) -> Trajectories:
     """Several sets as one, all as long as the longest."""
     steps = max(each.steps for each in sets)
     return Trajectories.concatenate([each.padded(steps) for each in sets])
-
-
-def needs_gradient(twin: Twin) -> bool:
-    """Whether a correction that takes derivatives by commands needs a surrogate of the twin."""
-    return not (isinstance(twin, Surrogate) or callable(twin))
