@@ -32,6 +32,7 @@ from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
 from retwin.update.surrogate_error import surrogate_variance
+from retwin.update.training_range import training_checked
 
 ERRORS = 4.0
 """Errors of the outputs, over those in calibration, from which on a trajectory is unknown: from few
@@ -135,6 +136,19 @@ def fit_inversion(
         remedy="label healthy trajectories",
     )
     surrogate = exact_surrogate(surrogate)
+    with training_checked(surrogate, healthy.commands):
+        return _fit(surrogate, residual, healthy, faults, twin, false_rate)
+
+
+def _fit(
+    surrogate: Surrogate,
+    residual: ResidualModel,
+    healthy: Trajectories,
+    faults: Mapping[str, Fault | None],
+    twin: Twin | None,
+    false_rate: float,
+) -> InversionDiagnoser:
+    """The diagnoser, its noise and the bound of its answer "unknown" from healthy trajectories."""
     given = DiagnosisInputs.of(surrogate, residual, healthy)
     segments = given.context.segments
     found = surrogate_variance(surrogate, twin, healthy.commands, segments)

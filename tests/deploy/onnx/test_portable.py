@@ -511,7 +511,7 @@ def test_the_commands_export_and_predict(
         assert (code, "Warning" in err) == (0, False), err
         first = json.loads(out)["trajectories"][0]
         assert (first["diagnosis"], first["guard"], first["because_of"]) == (
-            *("", "outside", "outputs"),
+            *("unknown", "outside", "outputs"),
         )
         assert first["probability"] is None
         assert set(first["probabilities"].values()) == {None}
