@@ -88,6 +88,16 @@ def test_what_the_equations_lack_is_learned_and_predicts_another_record() -> Non
     scores = {s.who: s for s in rt.score_model(found.twin, records(5, slope=radiating))}
     assert scores["model"].rmse < 0.2 * scores["mean"].rmse
     assert list(scores) == ["model", "mean", "hold"]
+    for _, alone, now in found.parameters.values():  # identified values keep their meaning
+        assert now == alone
+
+
+@pytest.mark.slow
+def test_dynamics_are_compared_at_a_horizon() -> None:
+    settings = rt.Choice(candidates=FAST, horizon=5.0)
+    found = rt.fit(twin_of(), records(0, slope=radiating), settings)
+    assert found.chosen == "dynamics"
+    assert not found.score("dynamics").reason
 
 
 @pytest.mark.slow
@@ -201,6 +211,20 @@ def test_the_simplest_within_a_standard_error_is_taken() -> None:
     assert differences["better"] == (0.0, 0.0)
     del models["better"]
     assert Comparison(data, folds, models).simplest()[0] == "simple"
+
+
+def test_a_constant_deviation_is_taken_where_propagated_ones_do_not_describe_errors() -> None:
+    rng, spread = np.random.default_rng(0), np.linspace(0.01, 3.0, 400)[:, None]
+    data = records(0, slope=right, steps=400)
+    data = data.replace(observed=rng.normal(size=(1, 400, 1)))
+    folds = [fold for fold in folds_of(data) if not fold.edge]
+    nothing = np.zeros((1, 400, 1))
+    wrong = [Predicted(nothing, spread[None], nothing, propagated=True)] * len(folds)
+    exact = [Predicted(nothing, nothing + 1.0 + 0.01 * spread, nothing)] * len(folds)
+    comparison = Comparison(data, folds, {"wrong": wrong, "exact": exact})
+    assert comparison.constant == {"wrong": [True], "exact": [False]}
+    for i, fold in enumerate(folds):
+        assert comparison.deviation("wrong", i)[0, fold.held[0]] == pytest.approx(1.0, abs=0.15)
 
 
 def test_block_means_are_those_of_consecutive_samples() -> None:

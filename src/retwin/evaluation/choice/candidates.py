@@ -96,8 +96,9 @@ class Candidates:
 
     @cached_property
     def learned(self) -> FittedDynamics:
-        """Corrected state equations, and what they learned."""
-        return fit_dynamics(self.identified, self.records, self.settings.dynamics)  # type: ignore[arg-type]
+        """Corrected state equations, and what they learned; identified parameters keep their values."""
+        settings = replace(self.settings.dynamics, held=True)
+        return fit_dynamics(self.identified, self.records, settings)  # type: ignore[arg-type]
 
     @property
     def dynamics(self) -> DynamicsTwin:

@@ -112,7 +112,7 @@ def _fit(
     preferred, differences = comparison.simplest()
     chosen = settings.method or preferred
     model = trials.final(chosen)
-    model = _calibrated(model, trials, chosen)
+    model = _calibrated(model, trials, chosen, comparison)
     scores = _scores(trials, comparison, differences)
     predicted, deviation = _shown(comparison, chosen)
     found = Fitted(
@@ -237,7 +237,7 @@ class Trials:
         return self.whole.fits[name]()
 
 
-def _calibrated(model: Model, trials: Trials, name: str) -> Model:
+def _calibrated(model: Model, trials: Trials, name: str, comparison: Comparison) -> Model:
     """The model with bands that hold what the parts in time show."""
     records, found = trials.whole.records, []
     if name in trials.reasons:
@@ -249,6 +249,10 @@ def _calibrated(model: Model, trials: Trials, name: str) -> Model:
             free = free_moments(one, own.commands)[0]
             found.append((forecasts(one, own, leads), free, own, fold.held[fold.rows]))
     forecast = calibrate_forecasts(found, leads)
+    if comparison.constant[name].any():
+        assert isinstance(model, DynamicsTwin)
+        constant = np.where(comparison.constant[name], forecast.deviation[-1], 0.0)
+        model = replace(model, constant=constant)
     deviation = np.where(records.mask, free_moments(model, records.commands)[1], np.nan)
     with np.errstate(invalid="ignore"):
         size = np.sqrt(np.nanmean(deviation**2, axis=(0, 1)))

@@ -31,6 +31,7 @@ ARRAYS = (
     "free_process",
     "noise",
     "widening",
+    "constant",
 )
 """Attributes that are saved as arrays."""
 DOMAIN = ("low", "high", "mean", "speed")
@@ -67,6 +68,7 @@ def read_fields(folder: str | Path) -> dict[str, Any]:
         if "widening" in about:
             factor = finite("widening", about["widening"], least=0.0)
             earlier["widening"] = torch.full_like(weights["noise"], factor)
+        earlier["constant"] = torch.zeros_like(weights["noise"])
         weights = earlier | weights
         arrays = {name: weights[name].double().numpy() for name in ARRAYS}
         domain = Domain(*(weights[f"domain_{name}"].double().numpy() for name in DOMAIN))
@@ -88,7 +90,7 @@ def _check(equations: StateTwin, arrays: Mapping[str, NDArray], domain: Domain) 
     parameters, states = len(equations.parameters), len(traced.slope)
     shapes = [arrays[name].shape for name in ARRAYS]
     both = parameters + states
-    wanted = [(both,), (both, shapes[1][-1]), *[(states,)] * 4, *[(len(traced.outputs),)] * 2]
+    wanted = [(both,), (both, shapes[1][-1]), *[(states,)] * 4, *[(len(traced.outputs),)] * 3]
     require(
         shapes == wanted and all(np.isfinite(each).all() for each in arrays.values()),
         "weights",
