@@ -13,8 +13,6 @@ from retwin import catalog
 from retwin.checks import given, require
 from retwin.checks import one_of as in_catalog
 from retwin.cli.completion import one_of
-from retwin.cli.dynamics import LARGEST, SIGNIFICANT, fit_equations, white_errors
-from retwin.cli.methods import fit_method, residual_line
 from retwin.cli.options import CaseArgument, Horizon, Json, LogMapping, MaxBytes, Seed, seconds_of
 from retwin.cli.reading import read
 from retwin.cli.terminal import answer, bar, note, table
@@ -22,9 +20,15 @@ from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from retwin.cases.case import Case
     from retwin.evaluation import Choice, Fitted
-    from retwin.twins.twin import Twin
+    from retwin.evaluation.choice.stand_in import Simulating, StandIn
+    from retwin.update.dynamics import FittedDynamics
+
+LARGEST = 8
+"""Number of terms of the state equations that are printed."""
 
 data_option, model_option, choice_option = (
     partial(typer.Option, rich_help_panel=panel)
@@ -93,10 +97,19 @@ SurrogateMode = Annotated[
         autocompletion=one_of(catalog.SURROGATE_MODES),
     ),
 ]
-Yardstick = Annotated[
+Compare = Annotated[
     bool,
     choice_option(
-        "--yardstick/--no-yardstick", help="Compare with models without the twin, once saved."
+        "--compare/--no-compare",
+        help="Compare candidates; else fit that of the case, or of an option, alone.",
+    ),
+]
+Yardstick = Annotated[
+    bool | None,
+    choice_option(
+        "--yardstick/--no-yardstick",
+        help="Compare with models without the twin, once saved; by default if there are no "
+        "classes.",
     ),
 ]
 
@@ -107,7 +120,8 @@ def fit(
     real: RealSet = None,
     data: OneFile = None,
     horizon: Horizon = "free",
-    yardstick: Yardstick = True,
+    compare: Compare = True,
+    yardstick: Yardstick = None,
     dynamics: StateEquations = False,
     correction: Correction = None,
     surrogate: SurrogateMode = "auto",
@@ -126,89 +140,100 @@ def fit(
 
     Candidates are compared on parts of the records that are left out in turn, and the simplest of
     the best is taken: the twin as it is, identified parameters, corrected state equations, a
-    correction of the outputs. An option that names a method forces it, without a comparison; so
-    does a case with classes.
+    correction of the outputs. --dynamics and --correction take one whatever the comparison shows;
+    a case with classes takes its own correction. That is one of a surrogate, as is any with
+    --network, --twin-data, --simulations or --refine.
     """
-    from retwin.evaluation.choice.stand_in import Simulating, stand_in
+    from retwin.evaluation.choice.stand_in import Simulating
     from retwin.update.residual.fitting import calibrating
 
     holds = ("model.json", "weights.safetensors", "surrogate", "residual", "choice.json")
     check_place(out, folder=True, holds=(*holds, "report.html"))
     seconds = seconds_of("--horizon", horizon)
     in_catalog("--surrogate", surrogate, catalog.SURROGATE_MODES)
-    system = _system(case, network, correction, density, refine)
-    named = (network, correction, density, twin_data, simulations)
-    forced = dynamics or refine or calibrate_on != "healthy" or any(x is not None for x in named)
-    compared = not (forced or system.diagnosed)
     require(
-        compared or (horizon == "free" and surrogate == "auto"),
-        "--horizon, --surrogate",
-        expected="neither where a method is named, or the case has classes: nothing is compared",
-        got=f"--horizon {horizon}, --surrogate {surrogate}",
-        remedy="leave them out, or the options that name a method",
+        not dynamics or (correction is network is twin_data is None and calibrate_on == "healthy"),
+        "--dynamics",
+        expected="neither --correction, --network, --twin-data nor --calibrate-on all",
+        got="one of them",
+        remedy="state equations are corrected alone, by healthy records",
     )
-    measured = _measured(system, real, data, max_bytes, mapping)
-    # The path is absolute, since a model is also used from other folders.
-    name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
-    if dynamics:
-        fit_equations(system, measured, out, name, seed, as_json=as_json)
-        return
-    measured = _labelled(system, measured)
+    system = _system(case, network, correction, density, refine, simulations)
+    measured = _labelled(system, _measured(system, real, data, max_bytes, mapping))
     faults = system.faults if calibrate_on == "all" else calibrate_on
     calibrating(measured, faults)  # before a surrogate is trained, which takes minutes
-    if not compared:
-        fit_method(
-            system, measured, faults, name, out, twin_data=twin_data, simulations=simulations,
-            max_bytes=max_bytes, seed=seed, as_json=as_json,
-        )  # fmt: skip
-        return
-    how = Simulating(surrogate, system.sampler, system.per_class, system.network, system.training)
-    with bar("fit") as show:
-        twin, text = stand_in(
-            system.twin, measured, how, seed=seed, progress=lambda s: show("surrogate", s)
-        )
-    if text:
-        note(text)
-    settings = _choice(system, seconds)
-    _fit_chosen(
-        system, twin, measured, settings, name, out, seed, yardstick=yardstick, as_json=as_json
+    forced = system.diagnosed or correction is not None or not compare or faults != "healthy"
+    method = "dynamics" if dynamics else _own(system) if forced else ""
+    trained = system.diagnosed or refine or any((network, twin_data, simulations))
+    how = Simulating(
+        "on" if trained and surrogate == "auto" else surrogate,
+        system.sampler,
+        system.per_class,
+        system.network,
+        system.training,
+        read(twin_data, system, max_bytes=max_bytes) if twin_data else None,
+        system.state_surrogate if dynamics else None,
     )
+    settings = replace(
+        _choice(system, seconds), method=method, compare=compare, calibrate_on=faults
+    )
+    # The path is absolute, since a model is also used from other folders.
+    name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
+    last = not system.diagnosed and settings.compared if yardstick is None else yardstick
+    found, base = _carry_out(system, measured, how, settings, name, out, seed, yardstick=last)
+    _print(found, base, out, as_json=as_json)
 
 
-def _fit_chosen(
+def _carry_out(
     system: Case,
-    twin: Twin,
     measured: Trajectories,
+    how: Simulating,
     settings: Choice,
     name: str,
     out: Path,
     seed: int,
     *,
     yardstick: bool,
-    as_json: bool,
-) -> None:
-    """Compare, save, compare with models without the twin, and print."""
+) -> tuple[Fitted, StandIn]:
+    """Train a surrogate, compare, save, and compare with models without the twin."""
     import retwin as rt
     from retwin.evaluation.choice.fitting import with_yardstick
+    from retwin.evaluation.choice.stand_in import stand_in
     from retwin.report.choice import fit_page
+    from retwin.twins import keep_workers
 
-    original = system.twin if isinstance(twin, rt.Surrogate) else None
+    with keep_workers(), bar("fit") as show:
+        base = stand_in(
+            system.twin, measured, how, seed=seed, progress=lambda s: show("surrogate", s)
+        )
+    if base.text:
+        note(base.text)
+    stage = "candidates" if settings.compared else "model"
     with bar("fit") as show:
         found = rt.fit(
-            twin,
+            base.twin,
             measured,
             settings,
             seed=seed,
             case=name,
-            original=original,
-            progress=lambda s: show("candidates", s),
+            original=system.twin if isinstance(base.twin, rt.Surrogate) else None,
+            progress=lambda s: show(stage, s),
         )
         found.save(out, page=fit_page(found, str(out), title=system.title))
         if yardstick:
             note(f"Saved {out}; now models without the twin, to be compared with")
             found = with_yardstick(found, seed=seed, progress=lambda s: show("yardstick", s))
             found.save(out, page=fit_page(found, str(out), title=system.title))
-    _print(found, twin, out, as_json=as_json)
+    return found, base
+
+
+def _own(system: Case) -> str:
+    """The candidate that is the case's own correction."""
+    from retwin.update.corrections import DelayOffset
+
+    if system.correction.resolution == "step":
+        return "output"
+    return "delay_offset" if system.correction == DelayOffset() else "segments"
 
 
 def _choice(system: Case, horizon: float | None) -> Choice:
@@ -217,11 +242,11 @@ def _choice(system: Case, horizon: float | None) -> Choice:
     from retwin.update.residual import Density as PerSegment
     from retwin.update.residual import SequenceMixture
 
-    own, density = system.correction, system.density
+    density = system.density
     return rt.Choice(
         horizon=horizon,
         dynamics=system.dynamics,
-        correction=own if own.resolution == "segment" else None,
+        correction=system.correction,
         density=density if isinstance(density, PerSegment) else rt.Mixture(),
         sequence=density if isinstance(density, SequenceMixture) else SequenceMixture(),
     )
@@ -236,22 +261,32 @@ def _labelled(system: Case, measured: Trajectories) -> Trajectories:
 
 
 def _system(
-    case: str, network: str | None, correction: str | None, density: str | None, refine: bool
+    case: str,
+    network: str | None,
+    correction: str | None,
+    density: str | None,
+    refine: bool,
+    simulations: int | None,
 ) -> Case:
     """The case, with the options of the command in place of its own."""
     import retwin as rt
     from retwin.cases.file import check_density
-    from retwin.update.residual import Density
+    from retwin.update.residual import Density, SequenceMixture
 
     system = rt.cases.get(case)
     if network is not None:
         system = replace(
             system, network=catalog.make(catalog.NETWORKS, network, "network"), training=None
         )
+    if simulations is not None:
+        learned = replace(system.state_surrogate, simulations=simulations)
+        system = replace(system, per_class=simulations, state_surrogate=learned)
     if correction is not None:
-        system = replace(
-            system, correction=catalog.make(catalog.CORRECTIONS, correction, "correction")
-        )
+        own = catalog.make(catalog.CORRECTIONS, correction, "correction")
+        stepwise, suited = own.resolution == "step", system.density
+        if stepwise != isinstance(suited, SequenceMixture):
+            suited = SequenceMixture() if stepwise else rt.Mixture()
+        system = replace(system, correction=own, density=suited)
     if density is not None:
         system = replace(system, density=catalog.make(catalog.DENSITIES, density, "density"))
     check_density(system.correction, system.density)
@@ -289,13 +324,43 @@ def _measured(
     return given("--data", system.records, expected, got=got, remedy="give --real FILE")(data)[0]
 
 
-def _print(found: Fitted, twin: Twin, out: Path, *, as_json: bool) -> None:
+def _print(found: Fitted, base: StandIn, out: Path, *, as_json: bool) -> None:
     """Print the comparison and what it shows."""
-    import retwin as rt
-    from retwin.update import DynamicsTwin
+    from retwin.report.choice import model_sentences
 
+    shown: list[Any] = []
+    if found.parts:
+        how = "free simulation" if found.horizon is None else f"{found.horizon:g} s ahead"
+        shown += [
+            f"Predictions of parts of the records that were left out ({how}; CRPS in standard "
+            "deviations of the outputs):",
+            _compared(found),
+            "",
+        ]
+    learned = found.learned
+    if found.parameters:
+        titles = ("parameter", "before", "identified", "in the model", "strongest correlation")
+        rows = [_parameter(name, each, learned) for name, each in found.parameters.items()]
+        shown += [table(titles, rows, numbers=titles[1:4]), ""]
+    if learned is not None:
+        terms = [(each, f"{size:.3f}") for each, size in list(learned.terms.items())[:LARGEST]]
+        text = "The largest terms of the state equations, over the usual derivative of their state:"
+        shown += [text, table(("term", "size"), terms, numbers=("size",)), ""]
+    if base.errors:
+        own = [
+            (e["output"], f"{e['rmse']:.3g} {e['unit']}", f"{e['nrmse']:.2%}") for e in base.errors
+        ]
+        text = "Surrogate on held-out twin trajectories:"
+        shown += [text, table(("output", "RMSE", "NRMSE"), own, numbers=("RMSE", "NRMSE")), ""]
+    failed = [f"{e.title}: {e.reason}" for e in found.scores if e.reason and found.parts]
+    values = {"saved": str(out), **found.values, "surrogate": base.errors}
+    answer(values, *shown, *found.remarks, *model_sentences(found), *failed, as_json=as_json)
+    note(f"Saved {out}, with the comparison in {out / 'report.html'}")
+
+
+def _compared(found: Fitted) -> Table:
+    """The candidates, and the models without the twin."""
     units = dict(zip(found.records.outputs.names, found.records.outputs.units, strict=True))
-    columns = [f"RMSE {name} [{unit}]" for name, unit in units.items()]
     rows = [
         (
             ("→ " if each.name == found.chosen else "  ") + each.title,
@@ -306,59 +371,18 @@ def _print(found: Fitted, twin: Twin, out: Path, *, as_json: bool) -> None:
         )
         for each in found.scores
     ]
+    columns = [f"RMSE {name} [{unit}]" for name, unit in units.items()]
     heads = ["", *columns, "CRPS", "90 % bands hold", "time"]
-    how = "free simulation" if found.horizon is None else f"{found.horizon:g} s ahead"
-    parameters = [
-        (name, *(f"{value:.4g}" for value in each)) for name, each in found.parameters.items()
-    ]
-    shown: list[Any] = [
-        f"Predictions of parts of the records that were left out ({how}; CRPS in standard "
-        "deviations of the outputs):",
-        table(heads, rows, numbers=heads[1:]),
-        "",
-    ]
-    if parameters:
-        titles = ("parameter", "before", "identified", "in the model")
-        shown += [table(titles, parameters, numbers=titles[1:]), ""]
-    if found.learned is not None:
-        terms = [
-            (each, f"{size:.3f}") for each, size in list(found.learned.terms.items())[:LARGEST]
-        ]
-        text = "The largest terms of the state equations, over the usual derivative of their state:"
-        shown += [text, table(("term", "size"), terms, numbers=("size",)), ""]
-    lines = []
-    if isinstance(found.twin, rt.CorrectedTwin):
-        lines.append(residual_line(found.twin.residual))
-    white = {}
-    if isinstance(found.twin, DynamicsTwin):
-        white = white_errors(found.twin.predictive(found.records))
-        lines += [
-            f"One-step errors of {name} are {'not ' * (each['p'] < SIGNIFICANT)}white noise: the "
-            f"largest autocorrelation is {each['autocorrelation']:.2g} at {each['lag']:.3g} s "
-            f"(95 % limit {each['limit']:.2g}, Ljung and Box p = {each['p']:.2g})."
-            for name, each in white.items()
-        ]
-    surrogate = _surrogate_rows(twin)
-    if surrogate:
-        own = [
-            (e["output"], f"{e['rmse']:.3g} {e['unit']}", f"{e['nrmse']:.2%}") for e in surrogate
-        ]
-        text = "Surrogate on held-out twin trajectories:"
-        shown += [text, table(("output", "RMSE", "NRMSE"), own, numbers=("RMSE", "NRMSE")), ""]
-    failed = [f"{each.title}: {each.reason}" for each in found.scores if each.reason]
-    values = {"saved": str(out), **found.values, "surrogate": surrogate, "one_step_errors": white}
-    answer(values, *shown, *found.remarks, *lines, *failed, as_json=as_json)
-    note(f"Saved {out}, with the comparison in {out / 'report.html'}")
+    return table(heads, rows, numbers=heads[1:])
 
 
-def _surrogate_rows(twin: Twin) -> list[dict[str, Any]]:
-    """The errors of a surrogate on simulations of the twin that were held out."""
-    import retwin as rt
-
-    if not isinstance(twin, rt.Surrogate) or twin.fitted is None:
-        return []
-    figures, channels = twin.fitted.figures, twin.outputs
-    return [
-        {"output": n, "unit": u, "rmse": figures[f"rmse_{n}"], "nrmse": figures[f"nrmse_{n}"]}
-        for n, u in zip(channels.names, channels.units, strict=True)
-    ]
+def _parameter(
+    name: str, values: tuple[float, ...], learned: FittedDynamics | None
+) -> tuple[str, ...]:
+    """A parameter with its error and its strongest correlation beside corrected equations."""
+    before, alone, now = (f"{value:.4g}" for value in values)
+    if learned is None or name not in learned.errors:
+        return name, before, alone, now, ""
+    strongest = learned.strongest(name)
+    text = f"{strongest[1]:+.2f} with {strongest[0]}" if strongest else "–"
+    return name, before, alone, f"{now} ± {learned.errors[name]:.2g}", text

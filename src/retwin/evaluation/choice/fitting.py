@@ -35,6 +35,7 @@ from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.forecast_errors import ForecastErrors
 from retwin.update.forecasts import LEADS, calibrate_forecasts, forecasts, free_moments
+from retwin.update.residual.fitting import calibrating
 
 FAILURES = (InputError, SimulationError, RuntimeError, ArithmeticError, np.linalg.LinAlgError)
 """What ends a candidate, and not the comparison: refused records, diverging fits and trainings."""
@@ -66,7 +67,7 @@ def fit(
     records : Trajectories
         Measured outputs with commands. Of labelled records the healthy ones are used.
     settings : Choice
-        The candidates, and the horizon at which they are judged.
+        The candidates, and the horizon at which they are judged; or a method, without a comparison.
     seed : int
         Of networks and searches; the same seed gives the same bytes on the same machine.
     case : str
@@ -89,7 +90,7 @@ def fit(
 
     """
     with one_thread():  # fits are small, and threads that wait for each other take longer
-        return _fit(twin, _healthy(records), settings, seed, case, original, progress)
+        return _fit(twin, _used(records, settings), settings, seed, case, original, progress)
 
 
 def _fit(
@@ -105,6 +106,8 @@ def _fit(
     check_channels(twin, records, "records")
     whole = Candidates(twin, records, settings, seed, case, original)
     names = _names(whole, settings)
+    if not settings.compared:
+        return _fit_alone(replace(whole, progress=progress), began)
     folds = folds_of(records)
     trials = Trials(whole, folds, names, progress or (lambda _: None))
     trials.run()
@@ -133,18 +136,37 @@ def _fit(
     return with_yardstick(found, seed=seed) if settings.yardstick else found
 
 
-def _healthy(records: Trajectories) -> Trajectories:
-    """The healthy records; unlabelled ones are healthy where none has a label."""
-    if not records.known_labels:
-        return records.replace(labels=[HEALTHY] * len(records))
-    require(
-        HEALTHY in records.known_labels,
-        "records",
-        expected=f"at least one record labelled {HEALTHY!r}, or none with a label",
-        got=f"labels {sorted(records.known_labels)}",
-        remedy="label healthy records",
+def _fit_alone(whole: Candidates, began: float) -> Fitted:
+    """The given method, fitted to all records without a comparison."""
+    name, nothing = whole.settings.method, np.full(whole.records.observed.shape, np.nan)
+    since = time.process_time()
+    model = whole.fits[name]()
+    row = _row(name, None, {}, time.process_time() - since, "not compared")
+    return Fitted(
+        twin=model,
+        chosen=name,
+        preferred=name,
+        scores=(row,),
+        remarks=(
+            f"No comparison was made: {row.title}, fitted to all records; no part of them was left "
+            "out to judge it, and its bands are those of its own fit.",
+        ),
+        parameters=_parameters(whole, model),
+        horizon=whole.settings.horizon,
+        parts=(),
+        records=whole.records,
+        predicted=nothing,
+        deviation=nothing,
+        learned=whole.learned if "learned" in vars(whole) else None,
+        seconds=time.perf_counter() - began,
     )
-    return records.with_label(HEALTHY)
+
+
+def _used(records: Trajectories, settings: Choice) -> Trajectories:
+    """The records to calibrate on; unlabelled ones are healthy where none has a label."""
+    if not records.known_labels and settings.calibrate_on == "healthy":
+        return records.replace(labels=[HEALTHY] * len(records))
+    return records[calibrating(records, settings.calibrate_on)]
 
 
 def _names(candidates: Candidates, settings: Choice) -> list[str]:
@@ -351,13 +373,13 @@ def _scores(
 
 def _row(
     name: str,
-    comparison: Comparison,
+    comparison: Comparison | None,
     differences: dict[str, tuple[float, float]],
     seconds: float,
     reason: str,
 ) -> CandidateScore:
     title = CANDIDATES.get(name, name)
-    if reason or name not in comparison.predicted:
+    if reason or comparison is None or name not in comparison.predicted:
         n = float("nan")
         return CandidateScore(name, title, {}, n, n, n, n, n, seconds, reason)
     rmse = comparison.rmse(name)

@@ -1,10 +1,11 @@
-"""`stand_in`: a surrogate for a slow twin, checked against the twin; else the twin itself."""
+"""`stand_in`: a surrogate of a twin, checked against the twin; else the twin itself."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from retwin.twins.record_sampler import sampler_from
 from retwin.twins.samplers import CommandSampler, RecordedSampler
 from retwin.twins.twin import Twin
 from retwin.update.corrected import generate
+from retwin.update.dynamics import state_names
+from retwin.update.state_surrogate import StateSurrogate, fit_state_surrogate
 from retwin.update.surrogate import Surrogate, fit_surrogate
 
 SLOW = 0.03
@@ -51,6 +54,11 @@ class Simulating:
         The network that is tried first.
     training : Training, optional
         Its training; by default that of the network.
+    simulated : Trajectories, optional
+        Simulations of the twin, in place of those that would be made.
+    equations : StateSurrogate, optional
+        How state equations are learned that stand in for a twin without such, however fast it is;
+        by default no equations are.
 
     """
 
@@ -59,9 +67,46 @@ class Simulating:
     simulations: int = 400
     network: Network = MLP()  # noqa: RUF009 - frozen
     training: Training | None = None
+    simulated: Trajectories | None = None
+    equations: StateSurrogate | None = None
 
     def __post_init__(self) -> None:
         one_of("surrogate", self.mode, SURROGATE_MODES)
+
+
+@dataclass(frozen=True, eq=False)
+class StandIn:
+    """What corrections are fitted to.
+
+    Attributes
+    ----------
+    twin : Twin
+        The twin itself, a `Surrogate`, or a `StateTwin` that was learned.
+    text : str
+        What was decided, in a sentence; "" for the twin itself.
+    figures : dict of str to float
+        Errors of a surrogate.
+
+    """
+
+    twin: Twin
+    text: str = ""
+    figures: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def errors(self) -> list[dict[str, Any]]:
+        """By output, the errors of a surrogate on simulations that were held out."""
+        channels, kinds = self.twin.outputs, ("rmse", "nrmse", "own", "discrepancy")
+        return [
+            {"output": name, "unit": unit}
+            | {
+                kind: self.figures[f"{kind}_{name}"]
+                for kind in kinds
+                if f"{kind}_{name}" in self.figures
+            }
+            for name, unit in zip(channels.names, channels.units, strict=True)
+            if self.figures
+        ]
 
 
 def stand_in(
@@ -71,7 +116,7 @@ def stand_in(
     *,
     seed: int = 0,
     progress: Progress | None = None,
-) -> tuple[Twin, str]:
+) -> StandIn:
     """The twin that corrections are fitted to: the twin itself, or a surrogate of it.
 
     Parameters
@@ -89,8 +134,8 @@ def stand_in(
 
     Returns
     -------
-    Twin, str
-        The twin or a `Surrogate`, and what was decided, in a sentence.
+    StandIn
+        The twin or a surrogate, and what was decided.
 
     Raises
     ------
@@ -100,15 +145,19 @@ def stand_in(
 
     """
     if settings.mode == "off" or isinstance(twin, Surrogate):
-        return twin, ""
+        return StandIn(twin)
+    if settings.equations is not None:
+        return _equations(twin, records, settings, settings.equations, seed, progress)
     if settings.mode == "auto":
         begun = time.perf_counter()
         twin.simulate(records.commands[:1].astype(np.float64), seed=0)
         taken = time.perf_counter() - begun
         if taken < SLOW:
-            return twin, ""
+            return StandIn(twin)
     report = progress or (lambda _: None)
-    made, text = simulations_for(twin, records, settings, seed, lambda s: report(0.5 * s))
+    made, text = settings.simulated, ""
+    if made is None:
+        made, text = _simulations_for(twin, records, settings, seed, lambda s: report(0.5 * s))
     networks = [settings.network, *OTHERS]
     failures = []
     for i, network in enumerate(networks):
@@ -123,7 +172,7 @@ def stand_in(
         failure = _failure(surrogate, twin, records)
         if not failure:
             report(1.0)
-            return surrogate, text
+            return StandIn(surrogate, text, surrogate.fitted.figures if surrogate.fitted else {})
         failures.append(f"{type(network).__name__}: {failure}")
     raise InputError(
         "surrogate",
@@ -133,6 +182,26 @@ def stand_in(
         remedy="use the twin itself (--surrogate off), or train on more simulations, for longer, "
         "or with another network",
     )
+
+
+def _equations(
+    twin: Twin,
+    records: Trajectories,
+    settings: Simulating,
+    equations: StateSurrogate,
+    seed: int,
+    progress: Progress | None,
+) -> StandIn:
+    """The twin if it has state equations, else such that are learned from simulations."""
+    if state_names(twin):
+        return StandIn(twin)
+    commands = settings.sampler or records.commands
+    found = fit_state_surrogate(twin, commands, records, equations, seed=seed, progress=progress)
+    text = (
+        f"The twin shows no state equations. Others with {found.figures['states']:.0f} states "
+        "stand in for it, learned from simulations"
+    )
+    return StandIn(found.twin, text, found.figures)
 
 
 def _failure(surrogate: Surrogate, twin: Twin, records: Trajectories) -> str:
@@ -167,7 +236,7 @@ class _Healthy:
         return tuple(self.faults)
 
 
-def simulations_for(
+def _simulations_for(
     twin: Twin,
     records: Trajectories,
     settings: Simulating,
