@@ -231,6 +231,14 @@ def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.Mo
     code, out, err = call(*words)
     assert code == 0, err
     assert "36 segments of 12 EMULATED trajectories" in out
+    assert "→ a delay and an offset per segment" in out
+    alone = (*words[:-1], "alone", "--no-compare", "--correction", "command_space", "--json")
+    code, out, err = call(*alone)
+    assert code == 0, err
+    found = json.loads(out)
+    assert (found["chosen"], found["parts"]) == ("segments", [])
+    assert found["remarks"][0].startswith("No comparison was made: ")
+    assert Path("alone/report.html").stat().st_size > 1000
     (own / "elsewhere").mkdir()
     monkeypatch.chdir(own / "elsewhere")
     code, out, err = call("generate", "../model", "--per-class", 10, "--out", "made.npz")
@@ -246,16 +254,19 @@ def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.Mo
 
 
 def test_a_case_of_ones_own_without_classes(call, own: Path) -> None:
-    words = ("fit", "tank.toml", "--data", "record.csv", "--simulations", 12, "--out", "model")
+    words = ("fit", "tank.toml", "--data", "record.csv", "--simulations", 60, "--out", "model")
+    words += ("--correction", "additive", "--no-yardstick")
     code, out, err = call(*words)
     assert code == 0, err
+    assert "→ a residual of each output sample" in out
     assert "Residual model: 100 samples" in out
     assert "residual_level" in out
     assert "90 % band covers" in " ".join(out.split())
     code, out, err = call("--quiet", *words, "--json")
     printed = json.loads(out)
     assert (code, err) == (0, "")
-    assert printed["saved"] == "model"
+    assert (printed["saved"], printed["chosen"]) == ("model", "output")
+    assert {"none", "output"} <= {each["name"] for each in printed["candidates"]}
     assert [each.keys() for each in printed["surrogate"]] == [{"output", "unit", "rmse", "nrmse"}]
     assert printed["residual"].keys() == {"emulated", "reason", "figures"}
     assert call("generate", "model", "--per-class", 3, "--out", "made.npz")[0] == 0

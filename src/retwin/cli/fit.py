@@ -165,6 +165,9 @@ def fit(
     forced = system.diagnosed or correction is not None or not compare or faults != "healthy"
     method = "dynamics" if dynamics else _own(system) if forced else ""
     trained = system.diagnosed or refine or any((network, twin_data, simulations))
+    equations = system.state_surrogate
+    if dynamics and simulations is not None:
+        equations = replace(equations, simulations=simulations)
     how = Simulating(
         "on" if trained and surrogate == "auto" else surrogate,
         system.sampler,
@@ -172,7 +175,7 @@ def fit(
         system.network,
         system.training,
         read(twin_data, system, max_bytes=max_bytes) if twin_data else None,
-        system.state_surrogate if dynamics else None,
+        equations if dynamics else None,
     )
     settings = replace(
         _choice(system, seconds), method=method, compare=compare, calibrate_on=faults
@@ -279,8 +282,7 @@ def _system(
             system, network=catalog.make(catalog.NETWORKS, network, "network"), training=None
         )
     if simulations is not None:
-        learned = replace(system.state_surrogate, simulations=simulations)
-        system = replace(system, per_class=simulations, state_surrogate=learned)
+        system = replace(system, per_class=simulations)
     if correction is not None:
         own = catalog.make(catalog.CORRECTIONS, correction, "correction")
         stepwise, suited = own.resolution == "step", system.density

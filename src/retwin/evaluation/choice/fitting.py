@@ -104,18 +104,21 @@ def _fit(
 ) -> Fitted:
     began = time.perf_counter()
     check_channels(twin, records, "records")
-    whole = Candidates(twin, records, settings, seed, case, original)
+    alone = None if settings.compared else progress
+    whole = Candidates(twin, records, settings, seed, case, original, alone)
     names = _names(whole, settings)
-    if not settings.compared:
-        return _fit_alone(replace(whole, progress=progress), began)
+    since = time.process_time()
+    # First, so that settings of a given method that are wrong are so before the comparison.
+    given = whole.fits[settings.method]() if settings.method else None
+    if given is not None and not settings.compared:
+        return _not_compared(whole, given, time.process_time() - since, began)
     folds = folds_of(records)
     trials = Trials(whole, folds, names, progress or (lambda _: None))
     trials.run()
     comparison = trials.comparison
     preferred, differences = comparison.simplest()
     chosen = settings.method or preferred
-    model = trials.final(chosen)
-    model = _calibrated(model, trials, chosen)
+    model = _calibrated(given or trials.final(chosen), trials, chosen)
     scores = _scores(trials, comparison, differences)
     predicted, deviation = _shown(comparison, chosen)
     found = Fitted(
@@ -136,21 +139,20 @@ def _fit(
     return with_yardstick(found, seed=seed) if settings.yardstick else found
 
 
-def _fit_alone(whole: Candidates, began: float) -> Fitted:
-    """The given method, fitted to all records without a comparison."""
+def _not_compared(whole: Candidates, model: Model, taken: float, began: float) -> Fitted:
+    """The given method, of which nothing but its own fit is known."""
     name, nothing = whole.settings.method, np.full(whole.records.observed.shape, np.nan)
-    since = time.process_time()
-    model = whole.fits[name]()
-    row = _row(name, None, {}, time.process_time() - since, "not compared")
+    row = _row(name, None, {}, taken, "not compared")
+    text = (
+        f"No comparison was made: {row.title}, fitted to all records; none of them was left out to "
+        "judge it, and its bands are those of its own fit."
+    )
     return Fitted(
         twin=model,
         chosen=name,
         preferred=name,
         scores=(row,),
-        remarks=(
-            f"No comparison was made: {row.title}, fitted to all records; no part of them was left "
-            "out to judge it, and its bands are those of its own fit.",
-        ),
+        remarks=(text,),
         parameters=_parameters(whole, model),
         horizon=whole.settings.horizon,
         parts=(),
