@@ -142,7 +142,9 @@ def test_the_command_line_writes_it_from_a_fitted_model(tmp_path: Path, call) ->
     rt.save(real, tmp_path / "real.npz")
     model = tmp_path / "model"
     given = (tmp_path / "case.toml", "--real", tmp_path / "real.npz", "--simulations", 40)
-    code, _, err = call("fit", *given, "--correction", "delay_offset", "--no-compare", "--out", model)
+    code, _, err = call(
+        "fit", *given, "--correction", "delay_offset", "--no-compare", "--out", model
+    )
     assert code == 0, err
     net = tmp_path / "net.pt"
     words = ("export", "actuator-net", model, "--history", "0,2", "--json", "--out", net)

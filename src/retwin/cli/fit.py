@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,97 +21,52 @@ from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from retwin.cases.case import Case
     from retwin.evaluation import Choice, Fitted
     from retwin.evaluation.choice.stand_in import Simulating, StandIn
-    from retwin.update.dynamics import FittedDynamics
 
-LARGEST = 8
-"""Number of terms of the state equations that are printed."""
+data_option = partial(typer.Option, metavar="FILE", rich_help_panel="Data")
+model_option = partial(typer.Option, rich_help_panel="Model; by default the case's")
+choice_option = partial(typer.Option, rich_help_panel="Choice")
 
-data_option, model_option, choice_option = (
-    partial(typer.Option, rich_help_panel=panel)
-    for panel in ("Data", "Model; by default the case's", "Choice")
-)
+
+def _named(text: str, names: Iterable[str]) -> Any:
+    """An option that names an entry of the catalog."""
+    return model_option(metavar="NAME", help=text, autocompletion=one_of(names))
+
 
 ModelFolder = Annotated[
     Path, typer.Option(metavar="FOLDER", help="Where to save the updated twin.")
 ]
-RealSet = Annotated[
-    Path | None, data_option(metavar="FILE", help="Real trajectories to calibrate on.")
-]
-OneFile = Annotated[
-    Path | None, data_option(metavar="FILE", help="Or one file that the case splits in two.")
-]
-TwinSet = Annotated[
-    Path | None, data_option(metavar="FILE", help="Trajectories of the twin; else simulated.")
-]
+RealSet = Annotated[Path | None, data_option(help="Real trajectories to calibrate on.")]
+OneFile = Annotated[Path | None, data_option(help="Or one file that the case splits in two.")]
+TwinSet = Annotated[Path | None, data_option(help="Trajectories of the twin; else simulated.")]
 Simulations = Annotated[
     int | None, data_option(metavar="N", help="Trajectories simulated; else the case's.")
 ]
-CalibrateOn = Annotated[
-    str,
-    data_option(
-        metavar="NAME", help="healthy or all.", autocompletion=one_of(catalog.CALIBRATE_ON)
-    ),
-]
+CalibrateOn = Annotated[str, _named("healthy or all real trajectories.", catalog.CALIBRATE_ON)]
 Network = Annotated[
-    str | None,
-    model_option(
-        metavar="NAME",
-        help="Of a surrogate: mlp, lstm, tcn or state_space.",
-        autocompletion=one_of(catalog.NETWORKS),
-    ),
+    str | None, _named("Of a surrogate: mlp, lstm, tcn or state_space.", catalog.NETWORKS)
 ]
 Correction = Annotated[
-    str | None,
-    model_option(
-        metavar="NAME",
-        help="additive, delay_offset or command_space.",
-        autocompletion=one_of(catalog.CORRECTIONS),
-    ),
+    str | None, _named("additive, delay_offset or command_space.", catalog.CORRECTIONS)
 ]
 Density = Annotated[
-    str | None,
-    model_option(
-        metavar="NAME",
-        help="Distribution: mixture, flow or sequence_mixture.",
-        autocompletion=one_of(catalog.DENSITIES),
-    ),
+    str | None, _named("Distribution: mixture, flow or sequence_mixture.", catalog.DENSITIES)
 ]
 Refine = Annotated[bool, model_option("--refine", help="Fine-tune on outputs afterwards.")]
 StateEquations = Annotated[
-    bool,
-    model_option(
-        "--dynamics",
-        help="Correct the state equations, which are learned first if the twin is no StateTwin.",
-    ),
+    bool, model_option("--dynamics", help="Correct the state equations; learn them if need be.")
 ]
 SurrogateMode = Annotated[
-    str,
-    model_option(
-        "--surrogate",
-        metavar="MODE",
-        help="auto (for a slow twin), on or off.",
-        autocompletion=one_of(catalog.SURROGATE_MODES),
-    ),
+    str, _named("auto (for a slow twin), on or off.", catalog.SURROGATE_MODES)
 ]
 Compare = Annotated[
-    bool,
-    choice_option(
-        "--compare/--no-compare",
-        help="Compare candidates; else fit that of the case, or of an option, alone.",
-    ),
+    bool, choice_option("--compare/--no-compare", help="Compare candidates; else fit one alone.")
 ]
 Yardstick = Annotated[
     bool | None,
-    choice_option(
-        "--yardstick/--no-yardstick",
-        help="Compare with models without the twin, once saved; by default if there are no "
-        "classes.",
-    ),
+    choice_option("--yardstick/--no-yardstick", help="Compare with models without the twin, too."),
 ]
 
 
@@ -294,14 +250,15 @@ def _system(
     check_density(system.correction, system.density)
     if not refine:
         return system
-    if not isinstance(system.density, Density):
-        raise rt.InputError(
-            "--refine",
-            expected="a density of one z per segment, mixture or flow",
-            got=type(system.density).__name__,
-            remedy="leave it out",
-        )
-    return replace(system, density=replace(system.density, refinement=rt.Refinement()))
+    now = system.density
+    refined = given(
+        "--refine",
+        now if isinstance(now, Density) else None,
+        "a density of one z per segment, mixture or flow",
+        got=type(now).__name__,
+        remedy="leave it out",
+    )
+    return replace(system, density=replace(refined, refinement=rt.Refinement()))
 
 
 def _measured(
@@ -328,63 +285,26 @@ def _measured(
 
 def _print(found: Fitted, base: StandIn, out: Path, *, as_json: bool) -> None:
     """Print the comparison and what it shows."""
-    from retwin.report.choice import model_sentences
+    from retwin.report.choice import comparison_table, model_sentences, parameter_table, term_table
 
     shown: list[Any] = []
-    if found.parts:
-        how = "free simulation" if found.horizon is None else f"{found.horizon:g} s ahead"
-        shown += [
-            f"Predictions of parts of the records that were left out ({how}; CRPS in standard "
-            "deviations of the outputs):",
-            _compared(found),
-            "",
+    for each in (comparison_table(found), parameter_table(found), term_table(found)):
+        heads = [f"{column.group} {column.text}".strip() for column in each.columns]
+        rows = [
+            ("→ " * row[0].best + row[0].text, *(f"{cell.text} {cell.below}" for cell in row[1:]))
+            for row in each.rows
         ]
-    learned = found.learned
-    if found.parameters:
-        titles = ("parameter", "before", "identified", "in the model", "strongest correlation")
-        rows = [_parameter(name, each, learned) for name, each in found.parameters.items()]
-        shown += [table(titles, rows, numbers=titles[1:4]), ""]
-    if learned is not None:
-        terms = [(each, f"{size:.3f}") for each, size in list(learned.terms.items())[:LARGEST]]
-        text = "The largest terms of the state equations, over the usual derivative of their state:"
-        shown += [text, table(("term", "size"), terms, numbers=("size",)), ""]
-    if base.errors:
+        if rows:
+            shown += [f"{each.title}:", table(heads, rows, numbers=heads[1:]), ""]
+    figures, outputs = base.figures, found.records.outputs
+    if figures:
         own = [
-            (e["output"], f"{e['rmse']:.3g} {e['unit']}", f"{e['nrmse']:.2%}") for e in base.errors
+            (name, f"{figures[f'rmse_{name}']:.3g} {unit}", f"{figures[f'nrmse_{name}']:.2%}")
+            for name, unit in zip(outputs.names, outputs.units, strict=True)
         ]
         text = "Surrogate on held-out twin trajectories:"
         shown += [text, table(("output", "RMSE", "NRMSE"), own, numbers=("RMSE", "NRMSE")), ""]
     failed = [f"{e.title}: {e.reason}" for e in found.scores if e.reason and found.parts]
-    values = {"saved": str(out), **found.values, "surrogate": base.errors}
+    values = {"saved": str(out), **found.values, "surrogate": figures}
     answer(values, *shown, *found.remarks, *model_sentences(found), *failed, as_json=as_json)
     note(f"Saved {out}, with the comparison in {out / 'report.html'}")
-
-
-def _compared(found: Fitted) -> Table:
-    """The candidates, and the models without the twin."""
-    units = dict(zip(found.records.outputs.names, found.records.outputs.units, strict=True))
-    rows = [
-        (
-            ("→ " if each.name == found.chosen else "  ") + each.title,
-            *(f"{each.rmse[name]:.3g}" if each.rmse else "–" for name in units),
-            "–" if not each.rmse else f"{each.crps:.4f}",
-            f"{each.coverage:.0%}" if each.rmse else "–",
-            f"{each.seconds:.0f} s",
-        )
-        for each in found.scores
-    ]
-    columns = [f"RMSE {name} [{unit}]" for name, unit in units.items()]
-    heads = ["", *columns, "CRPS", "90 % bands hold", "time"]
-    return table(heads, rows, numbers=heads[1:])
-
-
-def _parameter(
-    name: str, values: tuple[float, ...], learned: FittedDynamics | None
-) -> tuple[str, ...]:
-    """A parameter with its error and its strongest correlation beside corrected equations."""
-    before, alone, now = (f"{value:.4g}" for value in values)
-    if learned is None or name not in learned.errors:
-        return name, before, alone, now, ""
-    strongest = learned.strongest(name)
-    text = f"{strongest[1]:+.2f} with {strongest[0]}" if strongest else "–"
-    return name, before, alone, f"{now} ± {learned.errors[name]:.2g}", text

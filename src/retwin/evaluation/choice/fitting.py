@@ -41,6 +41,7 @@ FAILURES = (InputError, SimulationError, RuntimeError, ArithmeticError, np.linal
 """What ends a candidate, and not the comparison: refused records, diverging fits and trainings."""
 
 
+@one_thread()  # fits are small, and threads that wait for each other take longer
 def fit(
     twin: Twin,
     records: Trajectories,
@@ -89,20 +90,7 @@ def fit(
         or no candidate that can be fitted.
 
     """
-    with one_thread():  # fits are small, and threads that wait for each other take longer
-        return _fit(twin, _used(records, settings), settings, seed, case, original, progress)
-
-
-def _fit(
-    twin: Twin,
-    records: Trajectories,
-    settings: Choice,
-    seed: int,
-    case: str,
-    original: Twin | None,
-    progress: Progress | None,
-) -> Fitted:
-    began = time.perf_counter()
+    began, records = time.perf_counter(), _used(records, settings)
     check_channels(twin, records, "records")
     alone = None if settings.compared else progress
     whole = Candidates(twin, records, settings, seed, case, original, alone)

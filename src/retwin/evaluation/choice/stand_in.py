@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from retwin.nets.training import Training
 from retwin.progress import Progress
 from retwin.twins.collected import SimulationError
 from retwin.twins.command_range import CommandRange
-from retwin.twins.faults import Fault
 from retwin.twins.record_sampler import sampler_from
 from retwin.twins.samplers import CommandSampler, RecordedSampler
 from retwin.twins.twin import Twin
@@ -85,28 +84,13 @@ class StandIn:
     text : str
         What was decided, in a sentence; "" for the twin itself.
     figures : dict of str to float
-        Errors of a surrogate.
+        Errors of a surrogate, see `Surrogate.fitted` and `FittedStateSurrogate`.
 
     """
 
     twin: Twin
     text: str = ""
     figures: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def errors(self) -> list[dict[str, Any]]:
-        """By output, the errors of a surrogate on simulations that were held out."""
-        channels, kinds = self.twin.outputs, ("rmse", "nrmse", "own", "discrepancy")
-        return [
-            {"output": name, "unit": unit}
-            | {
-                kind: self.figures[f"{kind}_{name}"]
-                for kind in kinds
-                if f"{kind}_{name}" in self.figures
-            }
-            for name, unit in zip(channels.names, channels.units, strict=True)
-            if self.figures
-        ]
 
 
 def stand_in(
@@ -224,18 +208,6 @@ def _failure(surrogate: Surrogate, twin: Twin, records: Trajectories) -> str:
     return ""
 
 
-@dataclass(frozen=True)
-class _Healthy:
-    """A system without faults, from which commands are drawn."""
-
-    sampler: CommandSampler
-    faults: dict[str, Fault | None] = field(default_factory=lambda: {HEALTHY: None})
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        return tuple(self.faults)
-
-
 def _simulations_for(
     twin: Twin,
     records: Trajectories,
@@ -257,7 +229,8 @@ def _simulations_for(
     half = max(1, settings.simulations // 2)
 
     def drawn(sampler: CommandSampler, count: int) -> Trajectories:
-        return generate(twin, _Healthy(sampler), per_class=count, seed=seed, progress=progress)
+        healthy = SimpleNamespace(sampler=sampler, faults={HEALTHY: None}, classes=(HEALTHY,))
+        return generate(twin, healthy, per_class=count, seed=seed, progress=progress)
 
     made, outside = [], ""
     if settings.sampler is not None:

@@ -5,6 +5,7 @@ computes, and other prose, which is in its template.
 """
 
 from retwin.report.choice.page import fit_page
+from retwin.report.choice.tables import comparison_table, parameter_table, term_table
 from retwin.report.choice.texts import model_sentences
 
-__all__ = ["fit_page", "model_sentences"]
+__all__ = ["comparison_table", "fit_page", "model_sentences", "parameter_table", "term_table"]
