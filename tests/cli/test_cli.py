@@ -221,6 +221,7 @@ def test_demo_with_a_wrong_folder_is_refused(
     assert "RETWIN_DATA: expected a folder with armpi/real_a.mat" in err
 
 
+@pytest.mark.slow
 def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code, out, err = call("twin", "info", "reach.toml")
     assert (code, "first" in out, "reach" in out) == (0, True, True), err
@@ -253,6 +254,7 @@ def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.Mo
     assert "macro_f1" in out
 
 
+@pytest.mark.slow
 def test_a_case_of_ones_own_without_classes(call, own: Path) -> None:
     words = ("fit", "tank.toml", "--data", "record.csv", "--simulations", 60, "--out", "model")
     words += ("--correction", "additive", "--no-yardstick")
@@ -267,7 +269,7 @@ def test_a_case_of_ones_own_without_classes(call, own: Path) -> None:
     assert (code, err) == (0, "")
     assert (printed["saved"], printed["chosen"]) == ("model", "output")
     assert {"none", "output"} <= {each["name"] for each in printed["candidates"]}
-    assert [each.keys() for each in printed["surrogate"]] == [{"output", "unit", "rmse", "nrmse"}]
+    assert {"rmse_level", "nrmse_level"} <= printed["surrogate"].keys()
     assert printed["residual"].keys() == {"emulated", "reason", "figures"}
     assert call("generate", "model", "--per-class", 3, "--out", "made.npz")[0] == 0
     made = rt.load("made.npz")

@@ -42,7 +42,7 @@ def fit_page(found: Fitted, folder: str, *, title: str) -> str:
         "anchors": set(),
         "images": {},
     }
-    figures = {"predictions": _predictions(found)}
+    figures = {"predictions": _predictions(found)} if found.parts else {}
     forecast = found.twin.forecast
     return templates.get_template("fit.html.j2").render(
         found=found,
@@ -57,7 +57,7 @@ def fit_page(found: Fitted, folder: str, *, title: str) -> str:
         comparison=comparison_table(found),
         parameters=parameter_table(found),
         terms=term_table(found),
-        sentences=model_sentences(found),
+        sentences=tuple(model_sentences(found)),
         bands=_bands(found),
         promised=forecast is not None and forecast.promised,
         figures=figures,
