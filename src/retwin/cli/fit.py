@@ -66,7 +66,10 @@ Compare = Annotated[
 ]
 Yardstick = Annotated[
     bool | None,
-    choice_option("--yardstick/--no-yardstick", help="Compare with models without the twin, too."),
+    choice_option(
+        "--yardstick/--no-yardstick",
+        help="Compare with models without the twin; by default where no method is taken.",
+    ),
 ]
 
 
@@ -138,7 +141,7 @@ def fit(
     )
     # The path is absolute, since a model is also used from other folders.
     name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
-    last = not system.diagnosed and settings.compared if yardstick is None else yardstick
+    last = not method if yardstick is None else yardstick
     found, base = _carry_out(system, measured, how, settings, name, out, seed, yardstick=last)
     _print(found, base, out, as_json=as_json)
 

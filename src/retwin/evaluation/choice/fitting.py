@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from retwin.catalog import CANDIDATES
 from retwin.checks import require
+from retwin.data.measured import check_magnitude
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.evaluation.choice.candidates import Candidates, Model
@@ -154,6 +155,7 @@ def _not_compared(whole: Candidates, model: Model, taken: float, began: float) -
 
 def _used(records: Trajectories, settings: Choice) -> Trajectories:
     """The records to calibrate on; unlabelled ones are healthy where none has a label."""
+    check_magnitude("calibration", records, ideal=True)
     if not records.known_labels and settings.calibrate_on == "healthy":
         return records.replace(labels=[HEALTHY] * len(records))
     return records[calibrating(records, settings.calibrate_on)]
