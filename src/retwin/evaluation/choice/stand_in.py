@@ -131,12 +131,21 @@ def stand_in(
     if settings.mode == "off" or isinstance(twin, Surrogate):
         return StandIn(twin)
     if settings.equations is not None:
-        return _equations(twin, records, settings, settings.equations, seed, progress)
+        if state_names(twin):
+            return StandIn(twin)
+        commands, how = settings.sampler or records.commands, settings.equations
+        found = fit_state_surrogate(twin, commands, records, how, seed=seed, progress=progress)
+        errors = (f"{found.figures[f'own_{name}']:.3g} in {name}" for name in twin.outputs.names)
+        text = (
+            f"The twin shows no state equations. Others with {found.figures['states']:.0f} states "
+            "stand in for it, learned from simulations; on the measured commands their RMS error "
+            f"is {', '.join(errors)}"
+        )
+        return StandIn(found.twin, text, found.figures)
     if settings.mode == "auto":
         begun = time.perf_counter()
         twin.simulate(records.commands[:1].astype(np.float64), seed=0)
-        taken = time.perf_counter() - begun
-        if taken < SLOW:
+        if time.perf_counter() - begun < SLOW:
             return StandIn(twin)
     report = progress or (lambda _: None)
     made, text = settings.simulated, ""
@@ -166,26 +175,6 @@ def stand_in(
         remedy="use the twin itself (--surrogate off), or train on more simulations, for longer, "
         "or with another network",
     )
-
-
-def _equations(
-    twin: Twin,
-    records: Trajectories,
-    settings: Simulating,
-    equations: StateSurrogate,
-    seed: int,
-    progress: Progress | None,
-) -> StandIn:
-    """The twin if it has state equations, else such that are learned from simulations."""
-    if state_names(twin):
-        return StandIn(twin)
-    commands = settings.sampler or records.commands
-    found = fit_state_surrogate(twin, commands, records, equations, seed=seed, progress=progress)
-    text = (
-        f"The twin shows no state equations. Others with {found.figures['states']:.0f} states "
-        "stand in for it, learned from simulations"
-    )
-    return StandIn(found.twin, text, found.figures)
 
 
 def _failure(surrogate: Surrogate, twin: Twin, records: Trajectories) -> str:

@@ -51,7 +51,9 @@ def comparison_table(found: Fitted) -> Table:
         *(Column(name, "RMS error") for name in units),
         *map(Column, ("CRPS", "behind the best", "90 % bands hold", "time")),
     ]
-    return Table("Candidates, the simplest first", heads, rows)
+    how = "free simulation" if found.horizon is None else f"{found.horizon:g} s ahead"
+    title = f"Errors of parts that were left out ({how}), the simplest candidate first"
+    return Table(title, heads, rows)
 
 
 def parameter_table(found: Fitted) -> Table:
