@@ -16,7 +16,7 @@ from retwin.evaluation.choice.fitting import with_yardstick
 from retwin.evaluation.choice.folds import Fold, block_means, folds_of
 from retwin.report.choice import fit_page
 from retwin.twins import State, StateTwin
-from retwin.update import StationaryNoise, free_moments
+from retwin.update import Dynamics, StationaryNoise, free_moments
 from retwin.update.blackbox import BLACK_BOXES
 
 INPUTS, OUTPUTS = rt.Channels(("power",), ("W",)), rt.Channels(("heat",), ("K",))
@@ -167,6 +167,43 @@ def test_a_twin_that_cannot_be_opened_again_is_not_saved(tmp_path: Path) -> None
     with pytest.raises(rt.InputError, match=r"case.*can be opened again"):
         found.save(tmp_path / "model")
     assert not (tmp_path / "model").exists()
+
+
+def test_without_a_comparison_the_method_is_fitted_to_all_records(tmp_path: Path) -> None:
+    data = records(0, 1, slope=radiating, steps=300)
+    alone = rt.Choice(method="parameters", compare=False)
+    found = rt.fit(twin_of(), data, alone)
+    assert (found.chosen, found.parts, found.score("parameters").rmse) == ("parameters", (), {})
+    (said,) = found.remarks
+    assert said.startswith("No comparison was made: identified parameters")
+    compared = rt.fit(twin_of(), data, rt.Choice(candidates=("parameters",), method="parameters"))
+    assert found.parameters == compared.parameters
+    assert (found.twin.forecast, compared.twin.forecast is None) == (None, False)
+    page = fit_page(found, "model", title="heater")
+    assert said in page
+    assert 'id="comparison"' not in page
+    assert 'id="comparison"' in fit_page(compared, "model", title="heater")
+    with pytest.raises(rt.InputError, match="method: expected a method where"):
+        rt.Choice(compare=False)
+
+
+def test_records_with_faults_are_used_where_their_classes_are_named() -> None:
+    data = records(0, 1, slope=right, steps=200).replace(labels=["Healthy", "leak"])
+    with pytest.raises(rt.InputError, match="method: expected a method where"):
+        rt.Choice(calibrate_on="all")
+    for calibrate_on, count in (("healthy", 1), ("all", 2), ({"leak": None}, 1)):
+        settings = rt.Choice(method="none", compare=False, calibrate_on=calibrate_on)
+        found = rt.fit(twin_of(), data, settings)
+        assert len(found.records) == count
+        assert found.values["residual"]["figures"]["samples"] == 200 * count
+
+
+def test_wrong_settings_of_a_given_method_end_it_before_the_comparison() -> None:
+    told: list[float] = []
+    wrong = rt.Choice(method="dynamics", dynamics=Dynamics(states=("nope",)))
+    with pytest.raises(rt.InputError, match="nope"):
+        rt.fit(twin_of(), records(0, slope=right), wrong, progress=told.append)
+    assert not told
 
 
 def test_an_identification_is_named_where_a_model_is_expected(tmp_path: Path) -> None:
