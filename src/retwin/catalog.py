@@ -387,6 +387,12 @@ SOURCES: Mapping[str, SourceEntry] = {
         (_DYNAMICS,),
         twin="retwin.study.sources:corrected_dynamics",
     ),
+    "fit": SourceEntry(
+        "Updated twin (chosen by its calibration)",
+        "healthy",
+        twin="retwin.study.sources:chosen",
+        simulates=True,
+    ),
     "arx": SourceEntry(
         "Linear model (ARX)",
         "healthy",

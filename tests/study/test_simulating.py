@@ -112,7 +112,7 @@ def in_two(path: Path) -> tuple[rt.Trajectories, rt.Trajectories]:
 
 
 PLAN = rt.StudyPlan(
-    sources=("twin", "ibg", "pi_ls", "mean_corrected", "ibg_rg", "pi_ls_rg"),
+    sources=("twin", "ibg", "pi_ls", "mean_corrected", "ibg_rg", "pi_ls_rg", "fit"),
     runs=1,
     per_class=40,
     folds=2,
@@ -144,6 +144,8 @@ def test_results_hold_simulations_instead_of_diagnoses(folder: Path) -> None:
     assert sources["twin"]["coverage90"] == [None], "a deterministic twin has no bands"
     # The gain explains all but the noise; the residual model has to learn it.
     assert np.mean(sources["pi_ls"]["rmse"]) == pytest.approx(0.02, abs=0.004)
+    assert np.mean(sources["fit"]["rmse"]) == pytest.approx(0.02, abs=0.004)
+    assert 0.8 <= np.mean(sources["fit"]["coverage90"]) <= 0.98
     assert np.mean(sources["ibg_rg"]["rmse"]) < 0.7 * np.mean(sources["ibg"]["rmse"])
     assert np.mean(sources["ibg_rg"]["coverage90"]) > 0.6
     assert sources["twin"]["twin_runs"] == 0

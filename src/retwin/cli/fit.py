@@ -103,6 +103,7 @@ def fit(
     a case with classes takes its own correction. That is one of a surrogate, as is any with
     --network, --twin-data, --simulations or --refine.
     """
+    import retwin as rt
     from retwin.evaluation.choice.stand_in import Simulating
     from retwin.update.residual.fitting import calibrating
 
@@ -137,7 +138,11 @@ def fit(
         equations if dynamics else None,
     )
     settings = replace(
-        _choice(system, seconds), method=method, compare=compare, calibrate_on=faults
+        rt.Choice.of(system),
+        horizon=seconds,
+        method=method,
+        compare=compare,
+        calibrate_on=faults,
     )
     # The path is absolute, since a model is also used from other folders.
     name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
@@ -196,22 +201,6 @@ def _own(system: Case) -> str:
     if system.correction.resolution == "step":
         return "output"
     return "delay_offset" if system.correction == DelayOffset() else "segments"
-
-
-def _choice(system: Case, horizon: float | None) -> Choice:
-    """The settings of the comparison, by the case."""
-    import retwin as rt
-    from retwin.update.residual import Density as PerSegment
-    from retwin.update.residual import SequenceMixture
-
-    density = system.density
-    return rt.Choice(
-        horizon=horizon,
-        dynamics=system.dynamics,
-        correction=system.correction,
-        density=density if isinstance(density, PerSegment) else rt.Mixture(),
-        sequence=density if isinstance(density, SequenceMixture) else SequenceMixture(),
-    )
 
 
 def _labelled(system: Case, measured: Trajectories) -> Trajectories:

@@ -13,6 +13,8 @@ from retwin.cases.case import Case
 from retwin.catalog import EXTRAS, SOURCES, SourceEntry
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import DANN, FineTune, FittedDiagnoser, Rocket, fit_diagnoser, fit_inversion
+from retwin.evaluation.choice import Choice, fit
+from retwin.evaluation.choice.stand_in import Simulating, stand_in
 from retwin.study.plan import StudyPlan
 from retwin.study.trial import Trial
 from retwin.twins.noisy import NoisyTwin, residual_scale
@@ -21,6 +23,7 @@ from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics import DynamicsTwin, state_names
 from retwin.update.residual import ResidualModel, SequenceMixture
+from retwin.update.surrogate import Surrogate
 
 
 def recorded_twin(trial: Trial) -> FittedDiagnoser:
@@ -64,6 +67,16 @@ def posterior_twin(trial: Trial) -> Twin:
 def corrected_dynamics(trial: Trial) -> Twin:
     """The twin with a learned discrepancy inside its state equations."""
     return trial.updated("dynamics")
+
+
+def chosen(trial: Trial) -> Twin:
+    """The twin with the correction that predicts left-out parts of the calibration set best."""
+    case, seed = trial.case, trial.seed("update")
+    how = Simulating("auto", case.sampler, case.per_class, case.network, case.training)
+    twin = case.parametric or case.twin
+    base = stand_in(twin, trial.healthy, how, seed=seed, progress=trial.progress).twin
+    original = twin if isinstance(base, Surrogate) else None
+    return fit(base, trial.healthy, Choice.of(case), seed=seed, original=original).twin
 
 
 def black_box(trial: Trial) -> Twin:
@@ -157,10 +170,10 @@ def lacking(name: str, case: Case, plan: StudyPlan) -> str:
         return f"a case with a correction besides the one at its outputs; {case.name!r} has none"
     if name == "inversion" and isinstance(case.density, SequenceMixture):
         return "a correction per segment"
-    if ("update", "dynamics") in source.needs and not state_names(case.twin):
+    learned = ("update", "dynamics") in source.needs
+    if learned and case.diagnosed and not state_names(case.twin):
         return (
-            f"a case whose twin is a StateTwin; that of {case.name!r} is none, but "
-            "fit_state_surrogate learns one from simulations"
+            f"a case without classes, or a twin that is a StateTwin; that of {case.name!r} is none"
         )
     if source.parametric and case.parametric is None:
         return f"a case that declares the free parameters of its twin; {case.name!r} does not"

@@ -22,6 +22,7 @@ from retwin.cases.case import Case
 from retwin.catalog import NEEDS, SOURCES, resolve
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis import FittedDiagnoser
+from retwin.evaluation.choice.stand_in import Simulating, stand_in
 from retwin.evaluation.diagnosers import finite_probabilities
 from retwin.evaluation.fidelity import (
     measure_fidelity,
@@ -242,11 +243,18 @@ class Work:
             fitted.twin.save(path)
             return {}
         if trial.job.name == "dynamics":
+            how = Simulating(
+                sampler=self.case.sampler,
+                equations=self.case.state_surrogate,
+            )
+            twin = self.case.parametric or self.case.twin
+            seed, progress = trial.seed("update"), trial.progress
+            base = stand_in(twin, trial.healthy, how, seed=seed, progress=progress).twin
             made = fit_dynamics(
-                self.case.twin,  # type: ignore[arg-type]  # checked before the study begins
+                base,  # type: ignore[arg-type]  # it has state equations
                 trial.healthy,
                 self.case.dynamics,
-                progress=trial.progress,
+                progress=progress,
             )
             made.twin.save(path)
             write_estimates(path, made)

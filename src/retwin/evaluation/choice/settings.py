@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 from retwin.catalog import CANDIDATES
 from retwin.checks import one_of, positive, require
@@ -15,6 +16,22 @@ from retwin.update.residual import Density, Mixture, SequenceMixture
 MEMBERS = 2
 """Members of a network that is fitted without a part of the records: more lower its error a little,
 and take as many times as long."""
+
+
+class Corrected(Protocol):
+    """What says how a twin is corrected, such as a `Case`."""
+
+    @property
+    def correction(self) -> Correction:
+        """A correction of the outputs or of the commands."""
+
+    @property
+    def density(self) -> Density | SequenceMixture:
+        """The distribution of z."""
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """The form of a discrepancy inside state equations."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +81,17 @@ class Choice:
     yardstick: bool = False
     compare: bool = True
     calibrate_on: str | Mapping[str, Fault | None] = "healthy"
+
+    @classmethod
+    def of(cls, case: Corrected) -> Choice:
+        """All candidates, with the forms of the corrections of a case."""
+        density, own = case.density, cls()
+        return cls(
+            dynamics=case.dynamics,
+            correction=case.correction,
+            density=density if isinstance(density, Density) else own.density,
+            sequence=density if isinstance(density, SequenceMixture) else own.sequence,
+        )
 
     @property
     def compared(self) -> bool:
