@@ -112,9 +112,7 @@ def read_case(path: str | Path) -> Case:
         return updated_built_in(home, settings, place)
     named = (catalog.CORRECTIONS, catalog.DENSITIES, catalog.NETWORKS)
     kinds = [kind for entries in named for kind in catalog.classes(entries)]
-    rate = settings.get("rate")
-    rate = rate if isinstance(rate, int | float) else None
-    keys = from_settings(CaseFile, settings, kinds, place=place, rate=rate)
+    keys = from_settings(CaseFile, settings, kinds, place=place)
     folder = home / keys.folder
     with at(key(place, "folder")):
         real_path(folder)
@@ -298,15 +296,13 @@ def _sampler(
     settings = {"kind": RampSampler.__name__, "rate": twin.rate, **value}
     if settings["kind"] == RecordedSampler.__name__:
         options = {name: v for name, v in settings.items() if name not in ("kind", "file")}
-        own_settings = checked(
-            RecordedSampler, options, place=place, besides=("commands",), rate=twin.rate
-        )
+        own_settings = checked(RecordedSampler, options, place=place, besides=("commands",))
         commands = _recorded(settings, twin, records, folder, place)
         with at(place):
             return RecordedSampler(commands, **own_settings)
     if limits is not None:
         settings = {"low": limits.low, "high": limits.high, **settings}
-    return from_config(settings, SAMPLERS, place=place, rate=twin.rate)
+    return from_config(settings, SAMPLERS, place=place)
 
 
 def _recorded(

@@ -230,9 +230,8 @@ class StreamMachine(Machine[Monitor]):
         self._origin, self._done, self._farthest, self._window = origin, done, done, window
         self._state, self._begins = arrays["monitor"], False
         self.void = bool(self.layout.state(self._state[None]).void[0])
-        if "status" in arrays:  # not in states of earlier versions of this program
-            self.evidence, *wrong = arrays["status"].tolist()
-            self._wrong = [int(each) for each in wrong]
+        self.evidence, *wrong = arrays["status"].tolist()
+        self._wrong = [int(each) for each in wrong]
         return True
 
     def _place(self, moment: int) -> int:

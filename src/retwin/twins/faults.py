@@ -154,10 +154,7 @@ class Stuck:
     label: str = "Stuck"
 
     def __post_init__(self) -> None:
-        low, high = checked_onset(self.onset)
-        # Decimals: in files a whole number is an onset in samples, as before version 0.1.0.
-        onset = (low, high) if isinstance(self.onset, Sequence) else low
-        object.__setattr__(self, "onset", onset)
+        checked_onset(self.onset)
 
     def onset_range(self, steps: int, rate: float) -> tuple[int, int]:
         """First and last sample at which it can begin in a trajectory of so many samples.

@@ -87,20 +87,18 @@ class Facts:
         }
 
     @classmethod
-    def of(cls, about: Mapping[str, Any], rate: float) -> Facts:
-        """The facts from the JSON values of `about`, of a system with this sample rate in Hz."""
+    def of(cls, about: Mapping[str, Any]) -> Facts:
+        """The facts from the JSON values of `about`."""
         faults = {
-            name: None if fault is None else from_config(fault, FAULTS, rate=rate)
+            name: None if fault is None else from_config(fault, FAULTS)
             for name, fault in about["faults"].items()
         }
         sampler = about["sampler"]
-        if sampler is not None:  # before version 0.1.0 it had no rate of its own
-            sampler = from_config({"rate": rate, **sampler}, SAMPLERS, rate=rate)
         return cls(
             case=str(about["case"]),
             faults=faults,
             sensor_rate=about["sensor_rate"],
             steps=about["steps"],
             max_segments=about["movements"],
-            sampler=sampler,
+            sampler=None if sampler is None else from_config(sampler, SAMPLERS),
         )
