@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 import retwin as rt
 from retwin.cases.animation import animate
-from retwin.cases.animation.offscreen import mujoco_pictures
 from retwin.cases.animation.shots import Shots
+from retwin.cases.animation.solid import mujoco_pictures
 from retwin.cases.armpi_fpv.body import ArmBody
 from retwin.cli.animate import animate as command
 from retwin.data.io import save
