@@ -160,7 +160,10 @@ def _run(code: str) -> tuple[str, str]:
     except subprocess.TimeoutExpired:
         return "", f"no end after {IMPORT_TIMEOUT:g} s"
     # Without a message the process was killed, by a signal that the code names.
-    reason = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+    lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+    # The message, which may take several lines, follows the traceback, whose lines are indented.
+    frames = [place for place, line in enumerate(lines) if line.startswith(" ")]
+    reason = " ".join(lines[frames[-1] + 1 if frames else 0 :])
     return done.stdout.strip(), reason if done.returncode else ""
 
 
