@@ -15,10 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
-import typer
-
 import retwin as rt
-from retwin.cli.options import Json
+from retwin.cli.options import Json, option
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.trajectories import HEALTHY
 from retwin.serialisation.files import write_json
@@ -63,18 +61,12 @@ class Timing:
 
 
 def bench(
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="JSON file for the figures, too.")
-    ] = None,
+    out: Annotated[Path | None, option("FILE", "JSON file for the figures, too.")] = None,
     n: Annotated[
-        int,
-        typer.Option(
-            "--n", metavar="N", help="Trajectories that times are given for.", min=9, max=MAX_COUNT
-        ),
+        int, option("N", "Trajectories that times are given for.", "--n", min=9, max=MAX_COUNT)
     ] = 3600,
     repeats: Annotated[
-        int,
-        typer.Option(metavar="N", help="Times that generation is timed.", min=1, max=MAX_REPEATS),
+        int, option("N", "Times that generation is timed.", min=1, max=MAX_REPEATS)
     ] = 3,
     as_json: Json = False,
 ) -> None:

@@ -23,7 +23,7 @@ from packaging.specifiers import SpecifierSet
 
 from retwin._version import __version__
 from retwin.catalog import DOWNLOADS, EXTRAS
-from retwin.cli.options import Json
+from retwin.cli.options import Json, option
 from retwin.cli.terminal import FAILED, answer, table
 from retwin.data.download import cache_folder
 from retwin.errors import InputError
@@ -66,8 +66,7 @@ class Check:
 
 def doctor(
     deep: Annotated[
-        bool,
-        typer.Option("--deep", help="Also load torch and others, which takes seconds."),
+        bool, option("", "Also load torch and others, which takes seconds.", "--deep")
     ] = False,
     as_json: Json = False,
 ) -> None:
