@@ -62,7 +62,7 @@ outputs = { level = { unit = "m" } }
 commands = { kind = "HoldSampler", duration = 100, hold_durations = [5, 30] }
 correction = "additive"
 network = { kind = "StateSpace", states = 2, hidden = 8 }
-training = { max_epochs = 10, batch = 4, rate = 1e-2 }
+training = { max_epochs = 10, batch_size = 4, learning_rate = 1e-2 }
 [density]
 kind = "SequenceMixture"
 members = 2

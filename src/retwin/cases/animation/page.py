@@ -17,7 +17,7 @@ VEIL = 0.88
 """Opacity of the veil over what is not yet reached, from 0 to 1."""
 WIDE = 1.5
 """Ratio of width to height from which on the chart is beside the picture and not below it."""
-INK, ALARM = "#1b1f24", "#8f2d00"
+INK, MUTED, ALARM = "#1b1f24", "#5a636e", "#8f2d00"
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ def film_pages(
         image = figure.figimage(blank, 0, height - inner[1], origin="upper")
     steps.append(_captions(figure, box, shots, text, size))
     if chart is not None:
-        steps.append(_draw_chart(figure, chart, shots, text, size, inner))
+        steps.append(_draw_chart(figure, chart, shots, size, inner))
     for i, picture in enumerate(frames):
         if image is not None:
             image.set_data(picture)
@@ -126,7 +126,9 @@ def _captions(
         legend[0] = (SOLID, "observed; the pose is inferred from the tip")
         legend.append((UPDATED, f"updated twin, {len(shots.drawn)} draws of the tip"))
     for place, (colour, line) in enumerate(legend):
-        figure.text(left, bottom + 1.5 * place * y, line, fontsize=0.9 * points, color=colour)
+        for shift, words, paint in ((0.0, "▬", colour), (2 * x, line, MUTED)):
+            where = left + shift, bottom + 1.5 * place * y
+            figure.text(*where, words, fontsize=0.9 * points, color=paint)
     return lambda frame: time.set_text(f"{shots.seconds[frame]:.2f} s")
 
 
@@ -178,17 +180,18 @@ def _draw_chart(
     figure: Any,
     chart: Chart,
     shots: Shots,
-    text: float,
     size: tuple[int, int],
     inner: tuple[int, int],
 ) -> Callable[[int], None]:
     """Draw the bands of the updated twin and what was measured, in the part beside the picture."""
-    beside = inner[1] == size[1]
-    x, y = (inner[0] if beside else 0) + 6 * text, 3.5 * text
-    width = size[0] - x - text
-    height = (size[1] if beside else size[1] - inner[1]) - y - 3.5 * text
-    box = (x / size[0], y / size[1], width / size[0], height / size[1])
-    axes = figure.add_axes(box, facecolor=PAPER)
+    left = inner[0] if inner[1] == size[1] else 0
+    width, height = size[0] - left, size[1] - (0 if left else inner[1])
+    text = max(5.0, min(width / 42, height / 13))
+    columns = 4 if width > 45 * text else 2
+    margins = 6 * text, 4.2 * text, (2.0 if columns == 4 else 3.5) * text
+    wide, tall = width - margins[0] - text, height - margins[1] - margins[2]
+    corners = (left + margins[0], margins[1], wide, tall)
+    axes = figure.add_axes(tuple(np.divide(corners, (*size, *size))), facecolor=PAPER)
     points = 65 * text / DPI
     for share, alpha in ((0.9, 0.25), (0.5, 0.4)):
         low, high = np.quantile(chart.drawn, [(1 - share) / 2, (1 + share) / 2], axis=0)
@@ -204,7 +207,7 @@ def _draw_chart(
     begin, end = chart.time[0], max(chart.time[-1], chart.time[0] + 1e-9)
     axes.set_xlim(begin, end)
     place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "frameon": False}
-    axes.legend(ncols=2, fontsize=points, **place)
+    axes.legend(ncols=columns, fontsize=points, **place)
     now = axes.axvline(begin, color=GHOST, linewidth=1)
     veil = axes.axvspan(begin, end, color=PAPER, alpha=VEIL, linewidth=0, zorder=5)
 
