@@ -20,7 +20,7 @@ from retwin.cases.based_on import merged, parameters_of, updated_built_in
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.named_twin import delayed_twin, imported, parametric_twin, read_twin
-from retwin.checks import one_of, require
+from retwin.checks import agree, one_of, require
 from retwin.data.io import load
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -324,13 +324,8 @@ def _recorded(
             found, _ = records(path)
         else:
             found = load(path)
-    require(
-        (found.inputs, found.rate) == (twin.inputs, twin.rate),
-        key(place, "file"),
-        expected=f"commands of {', '.join(twin.inputs.names)} at {twin.rate:g} Hz",
-        got=f"{', '.join(found.inputs.names) or 'none'} at {found.rate:g} Hz",
-        remedy="take data of this system",
-    )
+    names, remedy = ("inputs", "rate"), "take data of this system"
+    agree(key(place, "file"), found, twin, "that of the twin", names=names, remedy=remedy)
     return found.commands
 
 
@@ -373,13 +368,7 @@ def _checked_split(
         remedy="return (calibration, test)",
     )
     for each in made:
-        require(
-            (each.inputs, each.outputs, each.rate) == (twin.inputs, twin.outputs, twin.rate),
-            place,
-            expected=f"Trajectories of {', '.join(twin.inputs.names + twin.outputs.names)} at "
-            f"{twin.rate:g} Hz",
-            got=f"{', '.join(each.inputs.names + each.outputs.names)} at {each.rate:g} Hz",
-            remedy="give them the channels and the rate of the twin",
-        )
+        remedy = "give them the channels and the rate of the twin"
+        agree(place, each, twin, "that of the twin", remedy=remedy)
     calibration, test = made
     return calibration, test

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.table import Table
 
-from retwin.checks import require
+from retwin.checks import ends_in, nothing, require
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_files
 from retwin.cli.options import (
@@ -97,13 +97,7 @@ def map_log(
     from retwin.data.logs.proposal import propose_mapping
     from retwin.report.log_picture import log_picture
 
-    require(
-        out.suffix.lower() == ".toml",
-        "--out",
-        expected="a name that ends in .toml",
-        got=out,
-        remedy="give another name, such as mapping.toml",
-    )
+    ends_in("--out", out, (".toml",), remedy="give another name, such as mapping.toml")
     picture = out.with_suffix(".png")
     for place in (out, picture):
         check_place(place)
@@ -216,13 +210,9 @@ def _channels_of(
     """What files need of the case or the twin of that name, if one is given."""
     names = [channel_names(each) for each in (inputs, outputs)]
     if name is None:
-        require(
-            not any(names),
-            "--inputs, --outputs",
-            expected="the twin to which they belong, --case plant.fmu or module:function",
-            got=", ".join([*names[0], *names[1]]),
-            remedy="give --case too, or leave them out",
-        )
+        expected = "the twin to which they belong, --case plant.fmu or module:function"
+        remedy = "give --case too, or leave them out"
+        nothing("--inputs, --outputs", (*names[0], *names[1]), expected, remedy=remedy)
         return None
     if Path(name).suffix.lower() not in FILES and ":" not in name and not any(names):
         return data_case(name)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from retwin import twins
 from retwin.catalog import CASES, TWINS
-from retwin.checks import given, require
+from retwin.checks import agree, given, require
 from retwin.cli.animate import animate
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_faults, complete_twins
@@ -267,14 +267,8 @@ def _case(named: str | None, name: str, found: Twin) -> Case | None:
     if not (named or own):
         return None
     system = cases.get(named or own)
-    require(
-        (system.inputs, system.rate) == (found.inputs, found.rate),
-        "--case",
-        expected=f"a case with the twin's inputs, {', '.join(found.inputs.names)}, at "
-        f"{found.rate:g} Hz",
-        got=f"{system.name} with {', '.join(system.inputs.names)} at {system.rate:g} Hz",
-        remedy="name the case that this twin belongs to",
-    )
+    names, remedy = ("inputs", "rate"), "name the case that this twin belongs to"
+    agree("--case", system, found, "that of the twin", names=names, remedy=remedy)
     return system
 
 

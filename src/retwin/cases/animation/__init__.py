@@ -17,7 +17,7 @@ from retwin.cases.animation.film import check_film, write_film
 from retwin.cases.animation.page import Chart, film_pages, picture_size
 from retwin.cases.animation.shots import Pictures, Shots
 from retwin.cases.animation.solid import mujoco_pictures
-from retwin.checks import finite, one_of, require
+from retwin.checks import agree, finite, one_of, require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
@@ -115,18 +115,8 @@ def animate(
 
 def _draws(updated: Twin, one: Trajectories, seed: int) -> NDArray:
     """Outputs (draws, T, d_y) of the updated twin for the commands of a trajectory."""
-    for name, has, needs in (
-        ("inputs", updated.inputs.names, one.inputs.names),
-        ("outputs", updated.outputs.names, one.outputs.names),
-        ("rate", updated.rate, one.rate),
-    ):
-        require(
-            has == needs,
-            "updated",
-            expected=f"a twin with the {name} {needs} of the trajectory",
-            got=f"one with {has}",
-            remedy="give the corrected twin that was fitted for these data",
-        )
+    remedy = "give the corrected twin that was fitted for these data"
+    agree("updated", updated, one, "that of the trajectory", remedy=remedy)
     made = updated.simulate(np.repeat(one.commands, DRAWS, axis=0), seed=seed)
     require(
         bool(np.isfinite(made.observed).all()),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from retwin.checks import require, whole
+from retwin.checks import same_names, whole
 from retwin.serialisation.configs import from_config, to_config
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
@@ -64,13 +64,11 @@ class Facts:
     def check_classes(self, diagnoser: Any) -> None:
         """Raise InputError unless a diagnoser, if there is one, has these classes, each once."""
         given = self.classes if diagnoser is None else diagnoser.classes
-        require(
-            sorted(given) == sorted(self.classes),
-            "diagnoser",
-            expected=f"one of the classes of {self.case}, {', '.join(self.classes)}",
-            got=", ".join(given),
-            remedy="train it on trajectories of this case",
+        what, remedy = (
+            f"one of the classes of {self.case},",
+            "train it on trajectories of this case",
         )
+        same_names("diagnoser", given, self.classes, what, remedy=remedy)
 
     def about(self) -> dict[str, Any]:
         """The facts as JSON values; InputError for a fault that is none of `FAULTS`."""
