@@ -23,16 +23,13 @@ from retwin.cli.commands import Commands
 from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase, argument, option
 from retwin.cli.reading import case_named, read, saved
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
-from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
     from retwin.monitor import Alarm, Cause, Monitor, Watched
-
-UNEXPLAINED = 0.5
-"""Probability from which on it is printed that a cause does not explain all."""
 
 Reading = Callable[..., Trajectories]
 """`cli.reading.read` with the options of the command."""
@@ -310,9 +307,7 @@ def audit(
 
 def _healthy(record: Trajectories, file: Path) -> Trajectories:
     """The healthy trajectories of a file."""
-    if record.labels is None:
-        return record
-    chosen = record[[i for i, label in enumerate(record.labels) if label in (HEALTHY, "")]]
+    chosen = record[record.maybe_healthy]
     require(
         len(chosen) > 0,
         str(file),
@@ -339,11 +334,10 @@ def _causes(
 
 def _written(cause: Cause) -> str:
     """A cause with its onset, and whether there is more to it."""
-    from retwin.monitor.cause import cause_title
+    from retwin.monitor.cause import cause_text
 
-    since = "" if isnan(cause.onset[0]) else f" from {cause.onset[0]:.6g} s"
-    more = ", and more than that" if since and cause.unknown > UNEXPLAINED else ""
-    return f"{cause_title(cause.name)}{since}{more}"
+    since = "" if isnan(cause.onset[0]) else f"{cause.onset[0]:.6g} s"
+    return cause_text(cause.name, since, cause.unknown)
 
 
 def _summary(file: Path, record: Trajectories, watched: Watched) -> str:

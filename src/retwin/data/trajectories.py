@@ -274,6 +274,11 @@ class Trajectories:
         arrays = {name: getattr(self, name)[:, span] for name in PER_SAMPLE}
         return self.replace(**arrays)
 
+    @property
+    def maybe_healthy(self) -> NDArray:
+        """Which trajectories (n,) are labelled as healthy, or not labelled."""
+        return np.isin(self.labels, (HEALTHY, UNLABELLED))
+
     def with_label(self, label: str) -> Trajectories:
         """The trajectories of class `label`."""
         return self[self.labels == label]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from retwin.checks import agree, at_least, finite, instance, require, whole
-from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.evaluation.experiments.actuators import ActuatorKnowledge
 from retwin.evaluation.experiments.dynamics import DynamicsKnowledge
 from retwin.evaluation.experiments.segments import SegmentKnowledge
@@ -183,7 +183,7 @@ def next_experiments(
     _check(twin, sampler, count, candidates)
     finite("tolerance", tolerance, least=1e-6, most=10)
     rng = np.random.default_rng(checked_seed(seed))
-    healthy = calibration[np.flatnonzero(np.isin(calibration.labels, [HEALTHY, ""]))]
+    healthy = calibration[calibration.maybe_healthy]
     remedy = "record any healthy ones first"
     least = 1 if isinstance(twin, DynamicsTwin) else MIN_TRAJECTORIES
     at_least("calibration", healthy, least, "healthy trajectories", remedy=remedy)
