@@ -20,7 +20,7 @@ from retwin.cases.animation.solid import mujoco_pictures
 from retwin.checks import agree, finite, one_of, require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.serialisation.files import write_atomically
 
 if TYPE_CHECKING:  # a case loads torch, which the worker that draws does not need
@@ -108,7 +108,7 @@ def animate(
         chart = _chart(one, drawn)
     target, inner = Path(path), picture_size(size, chart=chart is not None)
     with write_atomically(target) as part, _pictures(shots, body, inner, renderer) as pictures:
-        pages = _reported(film_pages(shots, size, pictures, chart), len(shots), progress)
+        pages = tracked(film_pages(shots, size, pictures, chart), len(shots), progress)
         write_film(pages, part, suffix, fps=fps, size=size)
     return target
 
@@ -249,11 +249,3 @@ def _pictures(
                 raise
             warnings.warn(f"drawn as a stick figure: {error}", stacklevel=5)
         yield found
-
-
-def _reported(pictures: Pictures, count: int, progress: Progress | None) -> Iterator[NDArray]:
-    """The same pictures; reports progress after each of them."""
-    for i, picture in enumerate(pictures):
-        yield picture
-        if progress is not None:
-            progress((i + 1) / count)
