@@ -154,7 +154,9 @@ class Stuck:
     label: str = "Stuck"
 
     def __post_init__(self) -> None:
-        checked_onset(self.onset)
+        low, high = checked_onset(self.onset)
+        onset = (low, high) if isinstance(self.onset, Sequence) else low
+        object.__setattr__(self, "onset", onset)
 
     def onset_range(self, steps: int, rate: float) -> tuple[int, int]:
         """First and last sample at which it can begin in a trajectory of so many samples.
