@@ -220,7 +220,7 @@ class StreamMachine(Machine[Monitor]):
 
     def restore(self, arrays: Mapping[str, NDArray]) -> bool:
         """Continue where `arrays` was stored; False if another version or monitor watched."""
-        if "stream" not in arrays:  # of a monitor of trajectories
+        if not {"stream", "status"} <= arrays.keys():  # of a monitor of trajectories, or older
             return False
         origin, done, self.newest, version, *window = arrays["stream"].tolist()
         other = not np.array_equal(arrays.get("digest", self.layout.digest), self.layout.digest)
