@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.arrays import runs
 from retwin.report.blocks import Cell, Section, Table, columns
 from retwin.report.figure import Axis, Figure, Key, Mark, Panel, Points, Row, Spans
 from retwin.report.labels import decimals, number, p_value, quantity, source_name, with_unit
@@ -244,7 +245,5 @@ def _over_time(errors: Errors, outside: NDArray, rate: float) -> Panel:
 def _runs(outside: NDArray, edges: NDArray, rate: float) -> Iterator[tuple[float, float]]:
     """Spans of time of the blocks with a sample outside; neighbours are one span."""
     starts = np.round(edges * rate).astype(int)
-    held = np.add.reduceat(outside, starts[:-1]) > 0
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
-    for first, last in ends.reshape(-1, 2).tolist():
+    for first, last in runs(np.add.reduceat(outside, starts[:-1]) > 0):
         yield float(edges[first]), float(edges[last])
