@@ -25,8 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from record import rounded
-from retwin.cli.benchmark import machine
+from record import machine, rounded
 from systems import SYSTEMS, System
 from systems.methods import JOBS, METHODS, score
 
