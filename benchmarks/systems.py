@@ -33,7 +33,7 @@ from retwin.processes import worker_pool
 from retwin.serialisation.files import write_atomically
 
 HERE = Path(__file__).parent
-LIMIT = 180.0
+LIMIT = 400.0
 """Longest processor time of a job in s; what it has not fitted until then has no score."""
 SHARED = {"arx", "narx", "neural_ss", "lstm"}
 """Jobs and models without a twin, which are fitted once for systems with the same records."""

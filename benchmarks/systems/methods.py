@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import retwin as rt
 from retwin.twins import StateTwin
-from retwin.update import DynamicsTwin, fit_black_box, fit_dynamics, fit_state_surrogate
+from retwin.update import DynamicsTwin, fit_black_box, fit_state_surrogate
 from systems.system import System
 
 SCORES = ("rmse", "crps", "coverage", "width")
@@ -66,12 +66,13 @@ def segments(system: System) -> Models:
 
 
 def dynamics(system: System) -> Models:
-    twin = identified(system)
+    twin = system.twin
     if not isinstance(twin.twin, StateTwin):
         commands = system.calibration.commands
-        twin = fit_state_surrogate(twin, commands, system.calibration, seed=0).twin
-    fitted = fit_dynamics(twin, system.calibration)
-    yield "dynamics", fitted.twin, f"held out {fitted.figures['held_out']:.3g}"
+        twin = fit_state_surrogate(identified(system), commands, system.calibration, seed=0).twin
+    fitted = rt.fit(twin, system.calibration, rt.Choice(method="dynamics", compare=False), seed=0)
+    assert fitted.learned is not None
+    yield "dynamics", fitted.twin, f"held out {fitted.learned.figures['held_out']:.3g}"
     yield "dynamics, output", output_correction(fitted.twin, system), ""
 
 

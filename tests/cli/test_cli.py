@@ -221,6 +221,7 @@ def test_demo_with_a_wrong_folder_is_refused(
     assert "RETWIN_DATA: expected a folder with armpi/real_a.mat" in err
 
 
+@pytest.mark.slow
 def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code, out, err = call("twin", "info", "reach.toml")
     assert (code, "first" in out, "reach" in out) == (0, True, True), err
@@ -231,6 +232,14 @@ def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.Mo
     code, out, err = call(*words)
     assert code == 0, err
     assert "36 segments of 12 EMULATED trajectories" in out
+    assert "→ a delay and an offset per segment" in out
+    alone = (*words[:-1], "alone", "--no-compare", "--correction", "command_space", "--json")
+    code, out, err = call(*alone)
+    assert code == 0, err
+    found = json.loads(out)
+    assert (found["chosen"], found["parts"]) == ("segments", [])
+    assert found["remarks"][0].startswith("No comparison was made: ")
+    assert Path("alone/report.html").stat().st_size > 1000
     (own / "elsewhere").mkdir()
     monkeypatch.chdir(own / "elsewhere")
     code, out, err = call("generate", "../model", "--per-class", 10, "--out", "made.npz")
@@ -245,18 +254,22 @@ def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.Mo
     assert "macro_f1" in out
 
 
+@pytest.mark.slow
 def test_a_case_of_ones_own_without_classes(call, own: Path) -> None:
-    words = ("fit", "tank.toml", "--data", "record.csv", "--simulations", 12, "--out", "model")
+    words = ("fit", "tank.toml", "--data", "record.csv", "--simulations", 60, "--out", "model")
+    words += ("--correction", "additive", "--no-yardstick")
     code, out, err = call(*words)
     assert code == 0, err
+    assert "→ a residual of each output sample" in out
     assert "Residual model: 100 samples" in out
     assert "residual_level" in out
     assert "90 % band covers" in " ".join(out.split())
     code, out, err = call("--quiet", *words, "--json")
     printed = json.loads(out)
     assert (code, err) == (0, "")
-    assert printed["saved"] == "model"
-    assert [each.keys() for each in printed["surrogate"]] == [{"output", "unit", "rmse", "nrmse"}]
+    assert (printed["saved"], printed["chosen"]) == ("model", "output")
+    assert {"none", "output"} <= {each["name"] for each in printed["candidates"]}
+    assert {"rmse_level", "nrmse_level"} <= printed["surrogate"].keys()
     assert printed["residual"].keys() == {"emulated", "reason", "figures"}
     assert call("generate", "model", "--per-class", 3, "--out", "made.npz")[0] == 0
     made = rt.load("made.npz")

@@ -59,7 +59,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (tmp_path / "case.toml").write_text(CASE.format(SLOW))
     (tmp_path / "own.toml").write_text(CASE.format('file = "real.npz"'))
     made = rt.cases.get(str(tmp_path / "case.toml")).twin.simulate(real_commands(), seed=0)
-    rt.save(made, tmp_path / "real.npz")
+    # Training of one epoch suffices beside a discrepancy of this size.
+    rt.save(made.replace(observed=made.observed + 3), tmp_path / "real.npz")
     return tmp_path
 
 

@@ -114,7 +114,8 @@ def drawn(seed: int, count: int) -> np.ndarray:
 def test_it_has_the_distribution_and_the_draws_of_the_twin(
     corrected: DynamicsTwin, version: str, tmp_path: Path
 ) -> None:
-    corrected = replace(corrected, widening=np.array([1.3, 0.8]))
+    constant = np.array([0.0, 0.05])
+    corrected = replace(corrected, widening=np.array([1.3, 0.8]), constant=constant)
     made = export_fmu(corrected, tmp_path / "tank.fmu", version=version)
     u, period = commanded(1, 5), 1 / corrected.rate
     assert made.delay == (period if corrected.equations.interpolation == "linear" else 0)
@@ -131,7 +132,9 @@ def test_it_has_the_distribution_and_the_draws_of_the_twin(
         axis=2
     )
     starts = by_all[:, :, -2:] * corrected.start_deviation
-    half = 1.6448536269514722 * corrected.widening * np.sqrt(variance + (starts**2).sum(axis=2))
+    deviation = np.sqrt(variance + (starts**2).sum(axis=2))
+    scale = np.where(constant > 0, constant / deviation, corrected.widening)
+    half = 1.6448536269514722 * scale * deviation
     for suffix, sign in (("q05", -1), ("q95", 1)):
         own = np.stack([found[f"{name}.{suffix}"] for name in outputs], axis=1)
         expected = behind(nominal[0] + sign * half, corrected)
@@ -147,7 +150,7 @@ def test_it_has_the_distribution_and_the_draws_of_the_twin(
     kicks[0, :-1] = rest[2:].reshape(-1, 4)[:, :2]
     kicks *= np.sqrt(corrected.free_process)
     kicked = steps.run(u, theta, kicks)[0][0] + np.sqrt(corrected.noise) * errors
-    expected = nominal[0] + corrected.widening * (kicked - nominal[0] + by_all @ moves)
+    expected = nominal[0] + scale * (kicked - nominal[0] + by_all @ moves)
     sampled = np.stack([found[name] for name in outputs], axis=1)
     np.testing.assert_allclose(sampled / spread, behind(expected, corrected) / spread, atol=1e-5)
 

@@ -16,7 +16,7 @@ from retwin.evaluation.choice.fitting import with_yardstick
 from retwin.evaluation.choice.folds import Fold, block_means, folds_of
 from retwin.report.choice import fit_page
 from retwin.twins import State, StateTwin
-from retwin.update import StationaryNoise, free_moments
+from retwin.update import Dynamics, StationaryNoise, free_moments
 from retwin.update.blackbox import BLACK_BOXES
 
 INPUTS, OUTPUTS = rt.Channels(("power",), ("W",)), rt.Channels(("heat",), ("K",))
@@ -88,6 +88,16 @@ def test_what_the_equations_lack_is_learned_and_predicts_another_record() -> Non
     scores = {s.who: s for s in rt.score_model(found.twin, records(5, slope=radiating))}
     assert scores["model"].rmse < 0.2 * scores["mean"].rmse
     assert list(scores) == ["model", "mean", "hold"]
+    for _, alone, now in found.parameters.values():  # identified values keep their meaning
+        assert now == alone
+
+
+@pytest.mark.slow
+def test_dynamics_are_compared_at_a_horizon() -> None:
+    settings = rt.Choice(candidates=FAST, horizon=5.0)
+    found = rt.fit(twin_of(), records(0, slope=radiating), settings)
+    assert found.chosen == "dynamics"
+    assert not found.score("dynamics").reason
 
 
 @pytest.mark.slow
@@ -159,6 +169,43 @@ def test_a_twin_that_cannot_be_opened_again_is_not_saved(tmp_path: Path) -> None
     assert not (tmp_path / "model").exists()
 
 
+def test_without_a_comparison_the_method_is_fitted_to_all_records(tmp_path: Path) -> None:
+    data = records(0, 1, slope=radiating, steps=300)
+    alone = rt.Choice(method="parameters", compare=False)
+    found = rt.fit(twin_of(), data, alone)
+    assert (found.chosen, found.parts, found.score("parameters").rmse) == ("parameters", (), {})
+    (said,) = found.remarks
+    assert said.startswith("No comparison was made: identified parameters")
+    compared = rt.fit(twin_of(), data, rt.Choice(candidates=("parameters",), method="parameters"))
+    assert found.parameters == compared.parameters
+    assert (found.twin.forecast, compared.twin.forecast is None) == (None, False)
+    page = fit_page(found, "model", title="heater")
+    assert said in page
+    assert 'id="comparison"' not in page
+    assert 'id="comparison"' in fit_page(compared, "model", title="heater")
+    with pytest.raises(rt.InputError, match="method: expected a method where"):
+        rt.Choice(compare=False)
+
+
+def test_records_with_faults_are_used_where_their_classes_are_named() -> None:
+    data = records(0, 1, slope=right, steps=200).replace(labels=["Healthy", "leak"])
+    with pytest.raises(rt.InputError, match="method: expected a method where"):
+        rt.Choice(calibrate_on="all")
+    for calibrate_on, count in (("healthy", 1), ("all", 2), ({"leak": None}, 1)):
+        settings = rt.Choice(method="none", compare=False, calibrate_on=calibrate_on)
+        found = rt.fit(twin_of(), data, settings)
+        assert len(found.records) == count
+        assert found.values["residual"]["figures"]["samples"] == 200 * count
+
+
+def test_wrong_settings_of_a_given_method_end_it_before_the_comparison() -> None:
+    told: list[float] = []
+    wrong = rt.Choice(method="dynamics", dynamics=Dynamics(states=("nope",)))
+    with pytest.raises(rt.InputError, match="nope"):
+        rt.fit(twin_of(), records(0, slope=right), wrong, progress=told.append)
+    assert not told
+
+
 def test_an_identification_is_named_where_a_model_is_expected(tmp_path: Path) -> None:
     (tmp_path / "identification.json").write_text("{}")
     with pytest.raises(rt.InputError, match="the folder of an identification"):
@@ -201,6 +248,20 @@ def test_the_simplest_within_a_standard_error_is_taken() -> None:
     assert differences["better"] == (0.0, 0.0)
     del models["better"]
     assert Comparison(data, folds, models).simplest()[0] == "simple"
+
+
+def test_a_constant_deviation_is_taken_where_propagated_ones_do_not_describe_errors() -> None:
+    rng, spread = np.random.default_rng(0), np.linspace(0.01, 3.0, 400)[:, None]
+    data = records(0, slope=right, steps=400)
+    data = data.replace(observed=rng.normal(size=(1, 400, 1)))
+    folds = [fold for fold in folds_of(data) if not fold.edge]
+    nothing = np.zeros((1, 400, 1))
+    wrong = [Predicted(nothing, spread[None], nothing, propagated=True)] * len(folds)
+    exact = [Predicted(nothing, nothing + 1.0 + 0.01 * spread, nothing)] * len(folds)
+    comparison = Comparison(data, folds, {"wrong": wrong, "exact": exact})
+    assert comparison.constant == {"wrong": [True], "exact": [False]}
+    for i, fold in enumerate(folds):
+        assert comparison.deviation("wrong", i)[0, fold.held[0]] == pytest.approx(1.0, abs=0.15)
 
 
 def test_block_means_are_those_of_consecutive_samples() -> None:

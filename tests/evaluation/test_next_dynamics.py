@@ -31,7 +31,7 @@ def learned(posterior: np.ndarray = POSTERIOR) -> DynamicsTwin:
     nothing, domain = np.zeros(1), Domain(*np.array([[-9.0] * 3, [9.0] * 3, [0.0] * 3]), np.ones(1))
     return DynamicsTwin(
         equations, np.array([1.0, 2.0, 0.0]), posterior, nothing, nothing, nothing, nothing,
-        np.array([NOISE]), 1.0, domain, (),
+        np.array([NOISE]), np.ones(1), np.zeros(1), domain, (),
     )  # fmt: skip
 
 

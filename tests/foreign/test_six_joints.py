@@ -55,7 +55,9 @@ def test_runs_are_described_and_split(folder: Path) -> None:
 
 def test_the_surrogate_is_good_where_the_arm_works(folder: Path, model: Path) -> None:
     found = json.loads((folder / "fit.json").read_text())
-    assert max(each["nrmse"] for each in found["surrogate"]) < 0.03
+    errors = [each for name, each in found["surrogate"].items() if name.startswith("nrmse_")]
+    assert len(errors) == 4
+    assert max(errors) < 0.03
     assert found["residual"]["figures"]["delays_at_bound"] == 0
     assert found["residual"]["figures"]["movements"] == 6 * six_joints.SEGMENTS
 

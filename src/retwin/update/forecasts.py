@@ -35,7 +35,7 @@ def free_moments(twin: Twin, commands: NDArray, *, seed: int = 0) -> tuple[NDArr
     """
     values = np.asarray(commands, np.float64)
     if isinstance(twin, DynamicsTwin):
-        return _of_dynamics(twin, values)
+        return twin.simulation.moments(values)
     if not isinstance(twin, CorrectedTwin):
         made = twin.simulate(values, seed=seed).observed.astype(np.float64)
         return made, np.zeros_like(made)
@@ -53,17 +53,6 @@ def free_moments(twin: Twin, commands: NDArray, *, seed: int = 0) -> tuple[NDArr
     return means, deviations
 
 
-def _of_dynamics(twin: DynamicsTwin, commands: NDArray) -> tuple[NDArray, NDArray]:
-    """By the linear propagation of the uncertain parameters, starts and noise."""
-    simulation, states = twin.simulation, len(twin.process)
-    factor = np.concatenate([twin.factor, np.zeros((len(twin.values), states))], axis=1)
-    factor[-states:, -states:] = np.diag(twin.start_deviation)
-    theta = np.tile(twin.values, (len(commands), 1))
-    mean, slopes = twin.equations.steps().sensitivities(commands, theta)
-    variance = simulation.noise_variance(commands) + np.sum((slopes @ factor) ** 2, axis=-1)
-    return mean, twin.widening * np.sqrt(variance)
-
-
 @dataclass(frozen=True, eq=False)
 class Forecasts:
     """Predictions of the samples of a record from measurements some time before.
@@ -71,10 +60,11 @@ class Forecasts:
     Attributes
     ----------
     mean : NDArray
-        (L, n, T, d_y), predictions some samples ahead; NaN where none was made.
+        (L, n, T, d_y), predictions some samples ahead; NaN where none was made, infinite where a
+        simulation from filtered states diverged.
     last : NDArray
         (L, n, T, d_y), the last error of the free simulation at that time, of which a share is
-        still to be added; 0 where states are filtered.
+        still to be added; 0 where states are filtered, and NaN where no prediction was made.
 
     """
 
@@ -97,7 +87,7 @@ def forecasts(twin: Twin, record: Trajectories, leads: Sequence[int]) -> Forecas
     """
     if isinstance(twin, DynamicsTwin):
         made = _from_states(twin, record, leads)
-        return Forecasts(made, np.zeros_like(made))
+        return Forecasts(made, np.where(np.isnan(made), np.nan, 0.0))
     free = free_moments(twin, record.commands)[0]
     error = np.where(record.mask, record.observed - free, np.nan)
     mean, last = (np.full((len(leads), *free.shape), np.nan) for _ in range(2))
@@ -132,6 +122,7 @@ def _from_states(twin: DynamicsTwin, record: Trajectories, leads: Sequence[int])
     theta = np.tile(twin.values, (len(row), 1))
     theta[:, -states.shape[2] :] = states[row, origin]
     found = twin.equations.steps().run(commands[row[:, None], place], theta, first=past)[0]
+    found = np.where(np.isfinite(found), found, np.inf)
     made = np.full((len(leads), count, steps, found.shape[2]), np.nan)
     for i, lead in enumerate(leads):
         inside = origin + lead < steps

@@ -55,6 +55,7 @@ def record(interpolation: str = "hold", proportional: float = 0.0) -> Record:
         free_process=np.array([1e-3, 1e-4]),
         noise=np.array([0.01, 0.02]),
         widening=np.ones(2),
+        constant=np.zeros(2),
         domain=Domain(np.full(3, -3.0), np.full(3, 3.0), np.ones(3), np.ones(2)),
         corrected=("speed", "current"),
     )

@@ -13,6 +13,7 @@
  *   START[NX]             deviations by which starts differ between instances
  *   PROCESS[NX], NOISE[NY] variances of process and measurement noise
  *   WIDENING[NY]          factors of the deviations from the mean
+ *   CONSTANT[NY]          deviations that are the same at all times; 0 for scaled ones
  *
  * and, where there was a calibration, RANGED and
  *
@@ -203,9 +204,10 @@ static void evaluate(Twin *twin)
             for (int k = 0; k < NX; k++)
                 variance += hx[i * NX + j] * twin->P[j * NX + k] * hx[i * NX + k];
         }
-        double half = QUANTILE * WIDENING[i] * sqrt(variance), drawn = 0.0;
+        double scale = CONSTANT[i] > 0.0 ? CONSTANT[i] / sqrt(variance) : WIDENING[i];
+        double half = QUANTILE * scale * sqrt(variance), drawn = 0.0;
         if (twin->noisy)
-            drawn = WIDENING[i] * (kicked[i] + twin->error[i] - mean[i] + moved);
+            drawn = scale * (kicked[i] + twin->error[i] - mean[i] + moved);
         twin->v[MEAN + i] = mean[i];
         twin->v[LOW + i] = mean[i] - half;
         twin->v[HIGH + i] = mean[i] + half;

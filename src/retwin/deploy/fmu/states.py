@@ -77,6 +77,7 @@ def _as_corrected(twin: StateTwin) -> DynamicsTwin:
         nothing,
         np.zeros(len(twin.outputs)),
         np.ones(len(twin.outputs)),
+        np.zeros(len(twin.outputs)),
         domain,
         (),
     )
@@ -135,6 +136,7 @@ def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
         "PROCESS": twin.free_process,
         "NOISE": twin.noise,
         "WIDENING": twin.widening,
+        "CONSTANT": twin.constant,
         "FIRST": twin.domain.mean[states:],
         "LONGEST": longest,
     }

@@ -9,6 +9,7 @@ from functools import cached_property
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.evaluation.choice.settings import Choice
+from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.record_sampler import moves_and_rests
 from retwin.twins.state_twin import StateTwin
@@ -31,7 +32,7 @@ class Candidates:
     twin : Twin
         The twin as it is given, or a surrogate of it.
     records : Trajectories
-        Healthy ones with commands.
+        Those that are used, with commands.
     settings : Choice
         The forms of the corrections.
     seed : int
@@ -40,6 +41,8 @@ class Candidates:
         The case that the models name.
     original : Twin, optional
         The twin of a surrogate, by which its error is measured.
+    progress : callable, optional
+        Called with the share of a fit that is done.
 
     """
 
@@ -49,6 +52,7 @@ class Candidates:
     seed: int
     case: str = ""
     original: Twin | None = None
+    progress: Progress | None = None
 
     @property
     def fits(self) -> dict[str, Callable[[], Model]]:
@@ -56,12 +60,13 @@ class Candidates:
         made: dict[str, Callable[[], Model]] = {"none": self.none}
         if self.free is not None:
             made["parameters"] = self.parameters
-        if self.segmented:
+        if self._segmented("delay_offset"):
             made["delay_offset"] = lambda: self.per_segment(DelayOffset())
         if state_names(self.twin):
             made["dynamics"] = lambda: self.dynamics
         own = self.settings.correction
-        if own is not None and own != DelayOffset() and self.segmented:
+        own = own if own is not None and own.resolution == "segment" else None
+        if own is not None and own != DelayOffset() and self._segmented("segments"):
             made["segments"] = lambda: self.per_segment(own)
         made["output"] = lambda: self.per_sample(self.identified)
         if state_names(self.twin):
@@ -76,9 +81,10 @@ class Candidates:
             return self.twin.parametric() if self.twin.free else None
         return self.twin if isinstance(self.twin, ParametricTwin) else None
 
-    @property
-    def segmented(self) -> bool:
-        """Whether the commands move and rest, so that each segment has a delay and an offset."""
+    def _segmented(self, name: str) -> bool:
+        """Whether the commands move and rest, which a correction per segment needs."""
+        if name == self.settings.method:
+            return True
         segments = Segments.from_commands(self.records.commands).until(self.records.lengths)
         return bool(moves_and_rests(segments))
 
@@ -96,8 +102,13 @@ class Candidates:
 
     @cached_property
     def learned(self) -> FittedDynamics:
-        """Corrected state equations, and what they learned."""
-        return fit_dynamics(self.identified, self.records, self.settings.dynamics)  # type: ignore[arg-type]
+        """Corrected state equations, whose parameters keep their values, and what they learned."""
+        return fit_dynamics(
+            self.identified,  # type: ignore[arg-type]
+            self.records,
+            replace(self.settings.dynamics, held=True),
+            progress=self.progress,
+        )
 
     @property
     def dynamics(self) -> DynamicsTwin:
@@ -114,7 +125,9 @@ class Candidates:
 
     def per_sample(self, twin: Twin) -> CorrectedTwin:
         """A twin whose outputs are corrected at every sample."""
-        return self._corrected(twin, Additive(), self.settings.sequence)
+        own = self.settings.correction
+        stepwise = own if own is not None and own.resolution == "step" else Additive()
+        return self._corrected(twin, stepwise, self.settings.sequence)
 
     def per_segment(self, correction: Correction) -> CorrectedTwin:
         """The twin with a correction that has one z per segment."""
@@ -130,6 +143,8 @@ class Candidates:
             correction,
             density,  # type: ignore[call-overload]
             seed=self.seed,
+            calibrate_on=self.settings.calibrate_on,
             twin=self.original,
+            progress=self.progress,
         )
         return CorrectedTwin(twin, residual, self.case)  # type: ignore[arg-type]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.evaluation.choice.folds import Fold, block_length, block_means
 from retwin.scores.distributions import crps_normal
+from retwin.update.dynamics import DynamicsTwin
 from retwin.update.forecast_errors import LEVEL, USUAL
 from retwin.update.forecasts import forecasts, free_moments
 
@@ -29,12 +30,16 @@ class Predicted:
         (r, T, d_y).
     last : NDArray
         (r, T, d_y), see `Forecasts`; 0 in free simulation.
+    propagated : bool
+        Whether deviations are those of uncertainty that the model propagates in time, so that a
+        constant may describe errors better.
 
     """
 
     mean: NDArray
     deviation: NDArray
     last: NDArray
+    propagated: bool = False
 
 
 def predict(model: object, records: Trajectories, fold: Fold, horizon: float | None) -> Predicted:
@@ -42,7 +47,8 @@ def predict(model: object, records: Trajectories, fold: Fold, horizon: float | N
     own = records[fold.rows]
     mean, deviation = free_moments(model, own.commands)  # type: ignore[arg-type]
     if horizon is None:
-        return Predicted(mean, deviation, np.zeros_like(mean))
+        propagated = isinstance(model, DynamicsTwin)
+        return Predicted(mean, deviation, np.zeros_like(mean), propagated)
     lead = max(1, round(horizon * records.rate))
     made = forecasts(model, own, [lead])  # type: ignore[arg-type]
     return Predicted(made.mean[0], np.ones_like(mean), made.last[0])
@@ -102,15 +108,40 @@ class Comparison:
 
     def deviation(self, name: str, i: int) -> NDArray:
         """Deviations (r, T, d_y) of a fold, scaled to hold what the other folds show."""
-        own = self.predicted[name][i].deviation
-        return np.maximum(own, 1e-9 * self.spread) * self._factor(name, i)
+        return self._deviation(name, i, self.constant[name])
 
-    def _factor(self, name: str, i: int) -> NDArray:
+    @cached_property
+    def constant(self) -> dict[str, NDArray]:
+        """By model, outputs (d_y,) whose deviation is the same at all times.
+
+        They are those where that predicts the parts that were left out better, by CRPS.
+        """
+        found = {}
+        for name, made in self.predicted.items():
+            neither, scores = np.zeros(len(self.spread), dtype=bool), []
+            for shape in (neither, ~neither):
+                each = [self._crps(name, i, shape).reshape(-1, len(shape)) for i in self._all]
+                scores.append(np.nanmean(np.concatenate(each), axis=0))
+            found[name] = (scores[1] < scores[0]) & made[0].propagated
+        return found
+
+    def _deviation(self, name: str, i: int, constant: NDArray) -> NDArray:
         ratios = []
         for j in self._others(i):
-            width = np.maximum(self.predicted[name][j].deviation, 1e-9 * self.spread)
-            ratios.append((np.abs(self.errors(name, j)) / width).reshape(-1, len(self.spread)))
-        return np.nanquantile(np.concatenate(ratios), LEVEL, axis=0) / USUAL
+            ratio = np.abs(self.errors(name, j)) / self._width(name, j, constant)
+            ratios.append(ratio.reshape(-1, len(self.spread)))
+        factor = np.nanquantile(np.concatenate(ratios), LEVEL, axis=0) / USUAL
+        return np.asarray(self._width(name, i, constant) * factor)
+
+    def _width(self, name: str, i: int, constant: NDArray) -> NDArray:
+        own = np.maximum(self.predicted[name][i].deviation, 1e-9 * self.spread)
+        return np.where(constant, self.spread, own)
+
+    def _crps(self, name: str, i: int, constant: NDArray) -> NDArray:
+        """CRPS (r, T, d_y) of a fold in standard deviations of the outputs."""
+        error = self.errors(name, i)
+        deviation = self._deviation(name, i, constant)
+        return np.asarray(crps_normal(error, np.zeros_like(error), deviation) / self.spread)
 
     def diverged(self, name: str) -> bool:
         """Whether a simulation left any reasonable range."""
@@ -121,8 +152,7 @@ class Comparison:
 
     def scores(self, name: str, i: int) -> NDArray:
         """CRPS (r, T) of a fold in standard deviations of the outputs, averaged over these."""
-        error = self.errors(name, i)
-        each = crps_normal(error, np.zeros_like(error), self.deviation(name, i)) / self.spread
+        each = self._crps(name, i, self.constant[name])
         seen = np.isfinite(each)
         count = seen.sum(axis=2)
         total = np.where(seen, each, 0.0).sum(axis=2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +81,7 @@ class Fitted:
     horizon : float or None
         Time ahead in s at which candidates were judged; None for free simulation.
     parts : tuple of str
-        What was left out in turn.
+        What was left out in turn; none where nothing was compared.
     measured, predicted, deviation : NDArray
         (n, T, d_y): the records, and the chosen candidate's predictions of the parts in time that
         were left out; NaN elsewhere.
@@ -126,6 +127,26 @@ class Fitted:
             "seconds": self.seconds,
             "dynamics": self._learned,
             "residual": self._residual,
+            "one_step_errors": self.one_step_errors,
+        }
+
+    @cached_property
+    def one_step_errors(self) -> dict[str, dict[str, float]]:
+        """By output, the largest autocorrelation of the errors of a filter, and a test of them.
+
+        Corrected state equations have a filter; there is none of other corrections.
+        """
+        if not isinstance(self.twin, DynamicsTwin):
+            return {}
+        made = self.twin.predictive(self.records)
+        return {
+            name: {
+                "autocorrelation": float(found.values[found.largest]),
+                "lag": float(found.lags[found.largest] / self.records.rate),
+                "limit": float(found.limits[found.largest]),
+                "p": p,
+            }
+            for name, (found, p) in zip(made.record.outputs.names, made.whiteness(), strict=True)
         }
 
     @property
@@ -141,10 +162,11 @@ class Fitted:
 
     @property
     def _residual(self) -> dict[str, Any] | None:
-        if not isinstance(self.twin, CorrectedTwin) or self.twin.residual.fitted is None:
+        residual = self.twin.residual if isinstance(self.twin, CorrectedTwin) else None
+        if residual is None or (fitted := residual.fitted) is None:
             return None
-        fitted = self.twin.residual.fitted
-        return {"figures": fitted.figures, "reason": fitted.reason}
+        figures = {name: _finite(each) for name, each in fitted.figures.items()}
+        return {"emulated": residual.emulated, "figures": figures, "reason": fitted.reason}
 
     def save(self, folder: str | Path, *, page: str = "") -> None:
         """Write the twin as `rt.load_twin` reads it, the comparison, and a page if one is given."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from retwin.catalog import CANDIDATES
 from retwin.checks import require
+from retwin.data.measured import check_magnitude
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.evaluation.choice.candidates import Candidates, Model
@@ -35,11 +36,13 @@ from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.forecast_errors import ForecastErrors
 from retwin.update.forecasts import LEADS, calibrate_forecasts, forecasts, free_moments
+from retwin.update.residual.fitting import calibrating
 
 FAILURES = (InputError, SimulationError, RuntimeError, ArithmeticError, np.linalg.LinAlgError)
 """What ends a candidate, and not the comparison: refused records, diverging fits and trainings."""
 
 
+@one_thread()  # fits are small, and threads that wait for each other take longer
 def fit(
     twin: Twin,
     records: Trajectories,
@@ -66,7 +69,7 @@ def fit(
     records : Trajectories
         Measured outputs with commands. Of labelled records the healthy ones are used.
     settings : Choice
-        The candidates, and the horizon at which they are judged.
+        The candidates, and the horizon at which they are judged; or a method, without a comparison.
     seed : int
         Of networks and searches; the same seed gives the same bytes on the same machine.
     case : str
@@ -88,31 +91,23 @@ def fit(
         or no candidate that can be fitted.
 
     """
-    with one_thread():  # fits are small, and threads that wait for each other take longer
-        return _fit(twin, _healthy(records), settings, seed, case, original, progress)
-
-
-def _fit(
-    twin: Twin,
-    records: Trajectories,
-    settings: Choice,
-    seed: int,
-    case: str,
-    original: Twin | None,
-    progress: Progress | None,
-) -> Fitted:
-    began = time.perf_counter()
+    began, records = time.perf_counter(), _used(records, settings)
     check_channels(twin, records, "records")
-    whole = Candidates(twin, records, settings, seed, case, original)
+    alone = None if settings.compared else progress
+    whole = Candidates(twin, records, settings, seed, case, original, alone)
     names = _names(whole, settings)
+    since = time.process_time()
+    # First, so that settings of a given method that are wrong are so before the comparison.
+    given = whole.fits[settings.method]() if settings.method else None
+    if given is not None and not settings.compared:
+        return _not_compared(whole, given, time.process_time() - since, began)
     folds = folds_of(records)
     trials = Trials(whole, folds, names, progress or (lambda _: None))
     trials.run()
     comparison = trials.comparison
     preferred, differences = comparison.simplest()
     chosen = settings.method or preferred
-    model = trials.final(chosen)
-    model = _calibrated(model, trials, chosen)
+    model = _calibrated(given or trials.final(chosen), trials, chosen, comparison)
     scores = _scores(trials, comparison, differences)
     predicted, deviation = _shown(comparison, chosen)
     found = Fitted(
@@ -133,18 +128,37 @@ def _fit(
     return with_yardstick(found, seed=seed) if settings.yardstick else found
 
 
-def _healthy(records: Trajectories) -> Trajectories:
-    """The healthy records; unlabelled ones are healthy where none has a label."""
-    if not records.known_labels:
-        return records.replace(labels=[HEALTHY] * len(records))
-    require(
-        HEALTHY in records.known_labels,
-        "records",
-        expected=f"at least one record labelled {HEALTHY!r}, or none with a label",
-        got=f"labels {sorted(records.known_labels)}",
-        remedy="label healthy records",
+def _not_compared(whole: Candidates, model: Model, taken: float, began: float) -> Fitted:
+    """The given method, of which nothing but its own fit is known."""
+    name, nothing = whole.settings.method, np.full(whole.records.observed.shape, np.nan)
+    row = _row(name, None, {}, taken, "not compared")
+    text = (
+        f"No comparison was made: {row.title}, fitted to all records; none of them was left out to "
+        "judge it, and its bands are those of its own fit."
     )
-    return records.with_label(HEALTHY)
+    return Fitted(
+        twin=model,
+        chosen=name,
+        preferred=name,
+        scores=(row,),
+        remarks=(text,),
+        parameters=_parameters(whole, model),
+        horizon=whole.settings.horizon,
+        parts=(),
+        records=whole.records,
+        predicted=nothing,
+        deviation=nothing,
+        learned=whole.learned if "learned" in vars(whole) else None,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _used(records: Trajectories, settings: Choice) -> Trajectories:
+    """The records to calibrate on; unlabelled ones are healthy where none has a label."""
+    check_magnitude("calibration", records, ideal=True)
+    if not records.known_labels and settings.calibrate_on == "healthy":
+        return records.replace(labels=[HEALTHY] * len(records))
+    return records[calibrating(records, settings.calibrate_on)]
 
 
 def _names(candidates: Candidates, settings: Choice) -> list[str]:
@@ -237,7 +251,7 @@ class Trials:
         return self.whole.fits[name]()
 
 
-def _calibrated(model: Model, trials: Trials, name: str) -> Model:
+def _calibrated(model: Model, trials: Trials, name: str, comparison: Comparison) -> Model:
     """The model with bands that hold what the parts in time show."""
     records, found = trials.whole.records, []
     if name in trials.reasons:
@@ -249,6 +263,10 @@ def _calibrated(model: Model, trials: Trials, name: str) -> Model:
             free = free_moments(one, own.commands)[0]
             found.append((forecasts(one, own, leads), free, own, fold.held[fold.rows]))
     forecast = calibrate_forecasts(found, leads)
+    if comparison.constant[name].any():
+        assert isinstance(model, DynamicsTwin)
+        constant = np.where(comparison.constant[name], forecast.deviation[-1], 0.0)
+        model = replace(model, constant=constant)
     deviation = np.where(records.mask, free_moments(model, records.commands)[1], np.nan)
     with np.errstate(invalid="ignore"):
         size = np.sqrt(np.nanmean(deviation**2, axis=(0, 1)))
@@ -351,13 +369,13 @@ def _scores(
 
 def _row(
     name: str,
-    comparison: Comparison,
+    comparison: Comparison | None,
     differences: dict[str, tuple[float, float]],
     seconds: float,
     reason: str,
 ) -> CandidateScore:
     title = CANDIDATES.get(name, name)
-    if reason or name not in comparison.predicted:
+    if reason or comparison is None or name not in comparison.predicted:
         n = float("nan")
         return CandidateScore(name, title, {}, n, n, n, n, n, seconds, reason)
     rmse = comparison.rmse(name)

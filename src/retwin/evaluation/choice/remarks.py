@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.evaluation.choice.comparison import Comparison
 from retwin.evaluation.choice.fitted import CandidateScore
+from retwin.evaluation.choice.folds import RECORDS
 from retwin.twins.twin import Twin
 
 EXPLAINED = 0.2
@@ -40,6 +41,12 @@ def remarks_of(
             f"{by_name[preferred].title}."
         )
     made += _worse_than_mean(records, by_name[chosen])
+    if len(records) < RECORDS:
+        made.append(
+            f"Parts of {len(records)} record{'s' * (len(records) > 1)} were left out, no whole "
+            "records: the bands are those of further parts of the same. How another day or machine "
+            f"differs cannot be seen; {RECORDS} records or more show it."
+        )
     if preferred in ("none", "parameters"):
         more = " with its identified parameters" if preferred == "parameters" else ""
         made.append(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from retwin.catalog import CANDIDATES
-from retwin.checks import one_of, positive
+from retwin.checks import one_of, positive, require
+from retwin.twins.faults import Fault
 from retwin.update.corrections import Correction
 from retwin.update.dynamics import Dynamics
 from retwin.update.residual import Density, Mixture, SequenceMixture
@@ -33,16 +34,23 @@ class Choice:
     dynamics : Dynamics
         The form of a discrepancy inside state equations.
     correction : Correction, optional
-        A correction with one z per segment, in place of a delay and an offset.
+        A correction of the case: per segment, beside a delay and an offset, or per sample, in place
+        of `Additive`.
     density, sequence : Density and SequenceMixture
         The distributions of z, one per segment and one per sample.
     yardstick : bool
         Whether models without the twin are fitted as well, to be compared with.
+    compare : bool
+        Whether candidates are compared; else `method` is fitted to all records, and its bands are
+        those of its own fit.
+    calibrate_on : str or mapping
+        The records that are used, see `fit_residual`; only healthy ones are compared.
 
     Raises
     ------
     InputError
-        An unknown candidate, or a horizon that is not positive.
+        An unknown candidate, a horizon that is not positive, or no method where nothing is
+        compared.
 
     """
 
@@ -54,6 +62,13 @@ class Choice:
     density: Density = Mixture()  # noqa: RUF009 - frozen
     sequence: SequenceMixture = SequenceMixture()  # noqa: RUF009 - frozen
     yardstick: bool = False
+    compare: bool = True
+    calibrate_on: str | Mapping[str, Fault | None] = "healthy"
+
+    @property
+    def compared(self) -> bool:
+        """Whether there is a comparison: records with faults are not predicted."""
+        return self.compare and self.calibrate_on == "healthy"
 
     @property
     def lighter(self) -> Choice:
@@ -67,3 +82,11 @@ class Choice:
             one_of("candidates", name, CANDIDATES)
         if self.horizon is not None:
             positive("horizon", self.horizon)
+        require(
+            self.method or self.compared,
+            "method",
+            expected="a method where candidates are not compared, or others than healthy records "
+            "are used",
+            got="none",
+            remedy=f"name one of {', '.join(CANDIDATES)}",
+        )

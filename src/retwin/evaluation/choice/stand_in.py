@@ -1,10 +1,11 @@
-"""`stand_in`: a surrogate for a slow twin, checked against the twin; else the twin itself."""
+"""`stand_in`: a surrogate of a twin, checked against the twin; else the twin itself."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -17,11 +18,12 @@ from retwin.nets.training import Training
 from retwin.progress import Progress
 from retwin.twins.collected import SimulationError
 from retwin.twins.command_range import CommandRange
-from retwin.twins.faults import Fault
 from retwin.twins.record_sampler import sampler_from
 from retwin.twins.samplers import CommandSampler, RecordedSampler
 from retwin.twins.twin import Twin
 from retwin.update.corrected import generate
+from retwin.update.dynamics import state_names
+from retwin.update.state_surrogate import StateSurrogate, fit_state_surrogate
 from retwin.update.surrogate import Surrogate, fit_surrogate
 
 SLOW = 0.03
@@ -51,6 +53,11 @@ class Simulating:
         The network that is tried first.
     training : Training, optional
         Its training; by default that of the network.
+    simulated : Trajectories, optional
+        Simulations of the twin, in place of those that would be made.
+    equations : StateSurrogate, optional
+        How state equations are learned that stand in for a twin without such, however fast it is;
+        by default no equations are.
 
     """
 
@@ -59,9 +66,31 @@ class Simulating:
     simulations: int = 400
     network: Network = MLP()  # noqa: RUF009 - frozen
     training: Training | None = None
+    simulated: Trajectories | None = None
+    equations: StateSurrogate | None = None
 
     def __post_init__(self) -> None:
         one_of("surrogate", self.mode, SURROGATE_MODES)
+
+
+@dataclass(frozen=True, eq=False)
+class StandIn:
+    """What corrections are fitted to.
+
+    Attributes
+    ----------
+    twin : Twin
+        The twin itself, a `Surrogate`, or a `StateTwin` that was learned.
+    text : str
+        What was decided, in a sentence; "" for the twin itself.
+    figures : dict of str to float
+        Errors of a surrogate, see `Surrogate.fitted` and `FittedStateSurrogate`.
+
+    """
+
+    twin: Twin
+    text: str = ""
+    figures: dict[str, float] = field(default_factory=dict)
 
 
 def stand_in(
@@ -71,7 +100,7 @@ def stand_in(
     *,
     seed: int = 0,
     progress: Progress | None = None,
-) -> tuple[Twin, str]:
+) -> StandIn:
     """The twin that corrections are fitted to: the twin itself, or a surrogate of it.
 
     Parameters
@@ -89,8 +118,8 @@ def stand_in(
 
     Returns
     -------
-    Twin, str
-        The twin or a `Surrogate`, and what was decided, in a sentence.
+    StandIn
+        The twin or a surrogate, and what was decided.
 
     Raises
     ------
@@ -100,15 +129,28 @@ def stand_in(
 
     """
     if settings.mode == "off" or isinstance(twin, Surrogate):
-        return twin, ""
+        return StandIn(twin)
+    if settings.equations is not None:
+        if state_names(twin):
+            return StandIn(twin)
+        commands, how = settings.sampler or records.commands, settings.equations
+        found = fit_state_surrogate(twin, commands, records, how, seed=seed, progress=progress)
+        errors = (f"{found.figures[f'own_{name}']:.3g} in {name}" for name in twin.outputs.names)
+        text = (
+            f"The twin shows no state equations. Others with {found.figures['states']:.0f} states "
+            "stand in for it, learned from simulations; on the measured commands their RMS error "
+            f"is {', '.join(errors)}"
+        )
+        return StandIn(found.twin, text, found.figures)
     if settings.mode == "auto":
         begun = time.perf_counter()
         twin.simulate(records.commands[:1].astype(np.float64), seed=0)
-        taken = time.perf_counter() - begun
-        if taken < SLOW:
-            return twin, ""
+        if time.perf_counter() - begun < SLOW:
+            return StandIn(twin)
     report = progress or (lambda _: None)
-    made, text = simulations_for(twin, records, settings, seed, lambda s: report(0.5 * s))
+    made, text = settings.simulated, ""
+    if made is None:
+        made, text = _simulations_for(twin, records, settings, seed, lambda s: report(0.5 * s))
     networks = [settings.network, *OTHERS]
     failures = []
     for i, network in enumerate(networks):
@@ -123,7 +165,7 @@ def stand_in(
         failure = _failure(surrogate, twin, records)
         if not failure:
             report(1.0)
-            return surrogate, text
+            return StandIn(surrogate, text, surrogate.fitted.figures if surrogate.fitted else {})
         failures.append(f"{type(network).__name__}: {failure}")
     raise InputError(
         "surrogate",
@@ -155,19 +197,7 @@ def _failure(surrogate: Surrogate, twin: Twin, records: Trajectories) -> str:
     return ""
 
 
-@dataclass(frozen=True)
-class _Healthy:
-    """A system without faults, from which commands are drawn."""
-
-    sampler: CommandSampler
-    faults: dict[str, Fault | None] = field(default_factory=lambda: {HEALTHY: None})
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        return tuple(self.faults)
-
-
-def simulations_for(
+def _simulations_for(
     twin: Twin,
     records: Trajectories,
     settings: Simulating,
@@ -188,7 +218,8 @@ def simulations_for(
     half = max(1, settings.simulations // 2)
 
     def drawn(sampler: CommandSampler, count: int) -> Trajectories:
-        return generate(twin, _Healthy(sampler), per_class=count, seed=seed, progress=progress)
+        healthy = SimpleNamespace(sampler=sampler, faults={HEALTHY: None}, classes=(HEALTHY,))
+        return generate(twin, healthy, per_class=count, seed=seed, progress=progress)
 
     made, outside = [], ""
     if settings.sampler is not None:

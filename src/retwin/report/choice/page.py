@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import isfinite
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +9,9 @@ import numpy as np
 from retwin._version import __version__
 from retwin.evaluation.choice.fitted import Fitted
 from retwin.report.assets import environment, plotly_js, script_json
-from retwin.report.blocks import Cell, Column, Table, columns
+from retwin.report.blocks import Cell, Table, columns
+from retwin.report.choice.tables import comparison_table, parameter_table, term_table, units_of
+from retwin.report.choice.texts import model_sentences
 from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
 from retwin.report.identification.figures import OUTPUTS, SAMPLES
 from retwin.report.identification.texts import significant
@@ -41,7 +42,7 @@ def fit_page(found: Fitted, folder: str, *, title: str) -> str:
         "anchors": set(),
         "images": {},
     }
-    figures = {"predictions": _predictions(found)}
+    figures = {"predictions": _predictions(found)} if found.parts else {}
     forecast = found.twin.forecast
     return templates.get_template("fit.html.j2").render(
         found=found,
@@ -53,8 +54,10 @@ def fit_page(found: Fitted, folder: str, *, title: str) -> str:
         if found.horizon is None
         else f"{found.horizon:g} s ahead of the last measurement",
         errors=_errors(found),
-        comparison=_comparison(found),
-        parameters=_parameters(found),
+        comparison=comparison_table(found),
+        parameters=parameter_table(found),
+        terms=term_table(found),
+        sentences=tuple(model_sentences(found)),
         bands=_bands(found),
         promised=forecast is not None and forecast.promised,
         figures=figures,
@@ -64,63 +67,17 @@ def fit_page(found: Fitted, folder: str, *, title: str) -> str:
     )
 
 
-def _units(found: Fitted) -> dict[str, str]:
-    pairs = zip(found.records.outputs.names, found.records.outputs.units, strict=True)
-    return {name: "" if unit == "1" else f" {unit}" for name, unit in pairs}
-
-
 def _errors(found: Fitted) -> list[str]:
     """The error of each output, in a sentence."""
-    units, score = _units(found), found.score(found.chosen)
+    units, score = units_of(found), found.score(found.chosen)
     return [
         f"Its RMS error in {name} is {significant(error)}{units[name]}."
         for name, error in score.rmse.items()
     ]
 
 
-def _comparison(found: Fitted) -> Table:
-    rows, units = [], _units(found)
-    for head, own in (("with the twin", True), ("without the twin", False)):
-        some = [each for each in found.scores if each.uses_twin is own]
-        if some and not own:
-            rows.append([Cell(head)])
-        for each in some:
-            best = each.name == found.chosen
-            if not each.rmse:
-                rows.append([Cell(each.title, each.reason), *[Cell("–")] * (len(units) + 4)])
-                continue
-            behind = significant(each.difference) if isfinite(each.difference) else "–"
-            error = f"± {significant(each.standard_error)}" if isfinite(each.standard_error) else ""
-            rows.append(
-                [
-                    Cell(each.title, "taken" if best else "", best=best),
-                    *(
-                        Cell(significant(each.rmse[name]) + units[name], best=best)
-                        for name in units
-                    ),
-                    Cell(significant(each.crps), best=best),
-                    Cell(behind, error),
-                    Cell(f"{each.coverage:.0%}"),
-                    Cell(duration(each.seconds)),
-                ]
-            )
-    heads = [
-        Column("candidate", numeric=False),
-        *(Column(name, "RMS error") for name in units),
-        *map(Column, ("CRPS", "behind the best", "90 % bands hold", "time")),
-    ]
-    return Table("Candidates, the simplest first", heads, rows)
-
-
-def _parameters(found: Fitted) -> Table:
-    rows = [
-        [Cell(name), *map(Cell, map(significant, each))] for name, each in found.parameters.items()
-    ]
-    return Table("Parameters", columns("parameter", "before", "identified", "in the model"), rows)
-
-
 def _bands(found: Fitted) -> Table:
-    forecast, units = found.twin.forecast, _units(found)
+    forecast, units = found.twin.forecast, units_of(found)
     if forecast is None:
         return Table("", [], [])
     rows = []

@@ -146,6 +146,8 @@ def fit_dynamics(
     checked_stride(base, observed, None, "observed")
     report = progress or (lambda share: None)
     unknowns = unknowns_of(base, free, values)
+    if settings.held:
+        unknowns = unknowns.only(np.arange(0))
     _check_samples(observed, unknowns.count + len(unknowns.free) + settings.folds)
     parts = folds(observed.mask, settings.folds)
     alone, fitted, best = chosen(base, observed, unknowns, settings, parts, report)
@@ -255,6 +257,7 @@ def assembled(
         np.zeros(len(start)),
         estimation.power(found.residual),
         np.ones(len(estimation.twin.outputs)),
+        np.zeros(len(estimation.twin.outputs)),
         Domain.visited(states, estimation.commands, speed),
         corrected,
         estimation.observed.emulated,

@@ -31,6 +31,7 @@ ARRAYS = (
     "free_process",
     "noise",
     "widening",
+    "constant",
 )
 """Attributes that are saved as arrays."""
 DOMAIN = ("low", "high", "mean", "speed")
@@ -81,7 +82,7 @@ def _check(equations: StateTwin, arrays: Mapping[str, NDArray], domain: Domain) 
     parameters, states = len(equations.parameters), len(traced.slope)
     shapes = [arrays[name].shape for name in ARRAYS]
     both = parameters + states
-    wanted = [(both,), (both, shapes[1][-1]), *[(states,)] * 4, *[(len(traced.outputs),)] * 2]
+    wanted = [(both,), (both, shapes[1][-1]), *[(states,)] * 4, *[(len(traced.outputs),)] * 3]
     require(
         shapes == wanted and all(np.isfinite(each).all() for each in arrays.values()),
         "weights",

@@ -40,6 +40,9 @@ class Dynamics:
     monotone : mapping of str to mapping of str to int
         Per corrected state, the variables in which its discrepancy is monotone: 1 where it is
         non-decreasing, -1 where it is non-increasing, whatever the other variables are.
+    held : bool, default False
+        Whether the parameters of the twin keep their values, and with them their meaning: the
+        discrepancy is what they leave. By default they are estimated together with it.
     passive : sequence of str
         Corrected states x whose discrepancy is non-increasing in x, and 0 where x is 0: so
         delta x <= 0, as with friction, and it never adds to the energy x^2 / 2.
@@ -54,6 +57,7 @@ class Dynamics:
     depends: Mapping[str, Sequence[str]] = field(default_factory=dict)
     monotone: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     passive: Sequence[str] = ()
+    held: bool = False
 
     def __post_init__(self) -> None:
         for name, kind in (("library", Library), ("network", TanhNetwork)):
@@ -78,6 +82,7 @@ class Dynamics:
             object.__setattr__(self, name, tuple(given))
         whole("folds", self.folds, least=2)
         one_of("memory", self.memory, (True, False))
+        one_of("held", self.held, (True, False))
         for state, variables in self.depends.items():
             require(
                 not isinstance(variables, str) and len(variables) > 0,

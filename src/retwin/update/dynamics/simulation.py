@@ -25,6 +25,7 @@ class FreeSimulation:
     free_process: NDArray
     noise: NDArray
     widening: NDArray
+    constant: NDArray
 
     def most_probable(self, commands: NDArray) -> tuple[NDArray, NDArray]:
         """Outputs and states without noise; equal commands are simulated once."""
@@ -63,8 +64,31 @@ class FreeSimulation:
                     commands[faulty], theta[faulty], changes=changes[faulty]
                 )[0]
             moved = np.moveaxis(by_all @ moves[rows].T, -1, 0)
-            made[rows] = centre + self.widening * (made[rows] - centre + moved)
+            scale = self.widening
+            if self.constant.any():
+                scale = self.scale(self._deviation(each[None], by_all[None]))[0]
+            made[rows] = centre + scale * (made[rows] - centre + moved)
         return made
+
+    def moments(self, commands: NDArray) -> tuple[NDArray, NDArray]:
+        """Means and standard deviations (n, T, d_y), by linear propagation of what is uncertain."""
+        theta = np.tile(self.values, (len(commands), 1))
+        mean, slopes = self.equations.steps().sensitivities(commands, theta)
+        deviation = self._deviation(commands, slopes)
+        return mean, self.scale(deviation) * deviation
+
+    def scale(self, deviation: NDArray) -> NDArray:
+        """Factors of propagated deviations (n, T, d_y)."""
+        given = self.constant / np.maximum(deviation, np.finfo(float).tiny)
+        return np.where(self.constant > 0, given, self.widening)
+
+    def _deviation(self, commands: NDArray, slopes: NDArray) -> NDArray:
+        """Deviations (n, T, d_y) by parameters, starts and noise, before they are scaled."""
+        states = len(self.start_deviation)
+        factor = np.pad(self.factor, ((0, 0), (0, states)))
+        factor[-states:, -states:] = np.diag(self.start_deviation)
+        moved = np.sum((slopes @ factor) ** 2, axis=-1)
+        return np.asarray(np.sqrt(self.noise_variance(commands) + moved))
 
     def noise_variance(self, commands: NDArray) -> NDArray:
         """Variances (n, T, d_y) of the outputs in free simulation by noise alone."""

@@ -67,6 +67,9 @@ class DynamicsTwin:
         sample, as those after a switch seem to be, cancel each other over many.
     widening : NDArray
         (d_y,), factors of the deviations from the most probable outputs, from held-out blocks.
+    constant : NDArray
+        (d_y,), standard deviations in free simulation of outputs that have the same at all times,
+        because held-out errors do not grow as the propagated uncertainty does; 0 for others.
     domain : Domain
         The range of states and commands in calibration.
     corrected : tuple of str
@@ -89,6 +92,7 @@ class DynamicsTwin:
     free_process: NDArray
     noise: NDArray
     widening: NDArray
+    constant: NDArray
     domain: Domain
     corrected: tuple[str, ...]
     emulated: bool = False
@@ -145,6 +149,7 @@ class DynamicsTwin:
             self.free_process,
             self.noise,
             self.widening,
+            self.constant,
         )
 
     def simulate(
