@@ -20,7 +20,7 @@ from record import record
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC, UNIT
-from retwin.cli.benchmark import median_seconds
+from retwin.cli.bench import median_seconds
 
 COUNT = 100
 QUANTILE90 = 1.645

@@ -14,12 +14,14 @@ from functools import partial
 from pathlib import Path
 
 from fmu import ms_per_run
-from record import peak_memory_gb, record
+from record import memory_bandwidth, peak_memory_gb, record
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC, ArmPiTwin
-from retwin.cli.benchmark import generating, memory_bandwidth
+from retwin.cases.case import Case
+from retwin.cli.bench import median_seconds
 from retwin.twins.fmu import FMUTwin
+from retwin.twins.twin import Twin
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 COUNT = 3600
@@ -38,6 +40,15 @@ def fmu_seconds(count: int) -> float:
         return count * ms_per_run(twin) / 1000
 
 
+def generating(
+    twin: Twin, case: Case, count: int, *, share: float = 1.0, repeats: int = REPEATS
+) -> float:
+    """Median time in s for `count` labelled trajectories, scaled up from a `share` of them."""
+    per_class = max(1, round(share * count / len(case.classes)))
+    make = partial(rt.generate, twin, case, per_class=per_class, seed=2)
+    return median_seconds(make, repeats) * count / (per_class * len(case.classes))
+
+
 def main(count: int) -> None:
     case = rt.cases.armpi()
     twin = rt.generate(case.twin, case, per_class=100, seed=0)
@@ -49,15 +60,15 @@ def main(count: int) -> None:
     )
     slow = "MuJoCo, steps of 1 ms"
     closed = "closed form: kinematics behind a servo lag"
-    measure = partial(generating, case=case, count=count, repeats=REPEATS)
+    measure = partial(generating, case=case, count=count)
     before = peak_memory_gb()
     seconds = {
-        slow: measure(ArmPiTwin(step=0.001), share=FEW)[0],
+        slow: measure(ArmPiTwin(step=0.001), share=FEW),
         "an FMU of one first-order lag": fmu_seconds(count),
-        "corrected, CommandSpace and SampledSensor": measure(in_commands)[0],
-        "corrected, DelayOffset": measure(at_outputs)[0],
-        "surrogate alone": measure(ibg)[0],
-        closed: measure(KINEMATIC)[0],
+        "corrected, CommandSpace and SampledSensor": measure(in_commands),
+        "corrected, DelayOffset": measure(at_outputs),
+        "surrogate alone": measure(ibg),
+        closed: measure(KINEMATIC),
     }
     made = rt.generate(in_commands, case, per_class=max(1, count // len(case.classes)), seed=2)
     size = sum(each.nbytes for each in (made.commands, made.nominal, made.observed, made.mask))

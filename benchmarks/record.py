@@ -7,23 +7,61 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import resource
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from retwin.cli.benchmark import machine
+from retwin._version import __version__
 from retwin.serialisation.files import write_atomically
 
+Result = TypeVar("Result")
 RESULTS = Path(os.environ.get("RETWIN_RESULTS", Path(__file__).parent / "results.json"))
 
 
 def peak_memory_gb() -> float:
     """The highest resident memory of this process so far."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+
+
+def machine() -> dict[str, Any]:
+    """The machine, versions and the date, for what is measured."""
+    lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "retwin": __version__,
+        "processor": (*names, platform.processor())[0],
+        "cores": os.cpu_count(),
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "torch": version("torch"),
+    }
+
+
+def memory_bandwidth() -> float:
+    """Bytes per second that one core writes to memory, the best of five copies of 256 MB."""
+    source, target = np.ones(2**25), np.zeros(2**25)
+    return target.nbytes / min(timed(lambda: np.copyto(target, source))[0] for _ in range(5))
+
+
+def timed(
+    make: Callable[[], Result], clock: Callable[[], float] = time.perf_counter
+) -> tuple[float, Result]:
+    """Time of `make` in s, by the wall clock unless another is given, and its result."""
+    started = clock()
+    result = make()
+    return clock() - started, result
 
 
 def record(name: str, title: str, rows: dict[str, float] | dict[str, dict[str, float]]) -> None:

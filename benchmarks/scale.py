@@ -20,11 +20,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import psutil
-from record import record
+from record import record, timed
 
 import retwin as rt
 from retwin import twins
-from retwin.cli.benchmark import timed
 from retwin.deploy.simulations import SimulationPlan, simulate_to
 from retwin.diagnosis.features import Features
 

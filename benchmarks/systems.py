@@ -25,11 +25,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from record import rounded
+from record import machine, rounded
 from systems import SYSTEMS, System
 from systems.methods import JOBS, METHODS, score
 
-from retwin.cli.benchmark import machine
 from retwin.processes import worker_pool
 from retwin.serialisation.files import write_atomically
 

@@ -15,15 +15,18 @@ import pytest
 from retwin.checks import (
     at_least,
     at_most,
+    ends_in,
     existing,
     finite,
     given,
     instance,
     needs_extra,
+    nothing,
     one_of,
     one_per,
     positive,
     require,
+    same_names,
     whole,
 )
 from retwin.errors import InputError
@@ -118,6 +121,25 @@ def test_a_number_of_things_has_a_limit() -> None:
     at_most("signals", 3, 3, "signals", remedy="name those that are wanted")
     error = refused(at_most, "signals", 4, 3, "signals", remedy="name those that are wanted")
     assert (error.expected, error.got) == ("at most 3 signals", "4")
+
+
+def test_what_must_not_be_there_is_listed() -> None:
+    nothing("parameters", [], "some of gain, leak", remedy="check the spelling")
+    error = refused(nothing, "parameters", ["a", "b"], "some of gain", remedy="check the spelling")
+    assert (error.expected, error.got) == ("some of gain", "a, b")
+
+
+def test_names_are_those_that_are_wanted() -> None:
+    same_names("columns", {"b": 1, "a": 2}, ("a", "b"), "a column for each of", remedy="name all")
+    for names, got in (((), "none"), (("a",), "a"), (("a", "b", "b"), "a, b, b")):
+        error = refused(same_names, "columns", names, "ab", "a column for each of", remedy="do")
+        assert (error.expected, error.got) == ("a column for each of a, b", got)
+
+
+def test_the_name_of_a_file_has_a_suffix() -> None:
+    ends_in("path", "film.GIF", (".mp4", ".gif"), remedy="choose one of these")
+    error = refused(ends_in, "path", "film.avi", (".mp4", ".gif"), remedy="choose one of these")
+    assert (error.expected, error.got) == ("a name that ends in .mp4 or .gif", "film.avi")
 
 
 def test_a_missing_file_is_named() -> None:

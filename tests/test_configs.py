@@ -1,4 +1,4 @@
-"""Config objects as plain values: the same object again, former names, and closed kinds."""
+"""Config objects as plain values: the same object again, and closed kinds."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import Any, Literal, Protocol
 import pytest
 
 from retwin.errors import InputError
-from retwin.serialisation import configs
-from retwin.serialisation.configs import Converted, checked, from_config, from_settings, to_config
+from retwin.serialisation.configs import checked, from_config, from_settings, to_config
 
 
 class Shape(Protocol):
@@ -107,39 +106,3 @@ def test_some_parameters_can_be_checked_alone() -> None:
     assert checked(Pair, {"count": [1, 2]}, place="a", besides=("first",)) == {"count": (1, 2)}
     with pytest.raises(InputError, match=r"a\.first: expected one of second, point, count"):
         checked(Pair, {"first": {}}, place="a", besides=("first",))
-
-
-def test_former_names_still_load(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(configs.RENAMED_KINDS, "Box", "Square")
-    monkeypatch.setitem(configs.RENAMED_SETTINGS, "Square", {"width": "side"})
-    assert from_config({"kind": "Box", "width": 2}, KINDS) == Square(2)
-    with pytest.raises(InputError, match=r"config\.side: expected a valid number"):
-        from_config({"kind": "Box", "width": "2"}, KINDS)
-
-
-@pytest.fixture
-def sides_in_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(configs.RENAMED_SETTINGS, "Square", {"width": Converted("side")})
-    monkeypatch.setitem(configs.RENAMED_SETTINGS, "Point", {"at": Converted("at")})
-
-
-@pytest.mark.usefixtures("sides_in_samples")
-def test_former_settings_in_samples_are_converted_by_the_rate() -> None:
-    values = {"kind": "Pair", "first": {"kind": "Square", "width": 3}, "point": {"at": [5, 10]}}
-    assert from_config(values, KINDS, rate=50.0) == Pair(Square(0.06), point=Point((0.1, 0.2)))
-    assert Converted("rate", lambda every, rate: rate / every).of([5, None], 50.0) == [10.0, None]
-    assert checked(Square, {"width": 3}, place="a", besides=(), rate=50.0) == {"side": 0.06}
-
-
-@pytest.mark.usefixtures("sides_in_samples")
-def test_a_setting_of_the_same_name_is_in_samples_only_as_whole_numbers() -> None:
-    assert from_config({"kind": "Point", "at": [5.0, 10]}, KINDS, rate=50.0) == Point((5.0, 10))
-    assert from_config({"kind": "Point", "at": [5, 10]}, KINDS) == Point((5, 10))
-
-
-@pytest.mark.usefixtures("sides_in_samples")
-def test_a_former_setting_in_samples_needs_a_rate() -> None:
-    with pytest.raises(InputError, match=r"config\.first\.width: expected side, in seconds or Hz"):
-        from_config({"kind": "Pair", "first": {"kind": "Square", "width": 3}}, KINDS)
-    with pytest.raises(InputError, match=r"config\.side: expected a valid number, got 'a'"):
-        from_config({"kind": "Square", "width": "a"}, KINDS, rate=50.0)

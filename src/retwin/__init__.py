@@ -55,97 +55,59 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from retwin._lazy import names
+from retwin._lazy import homes, names
 from retwin._version import __version__
 
 # Name to module, which is imported when the name is first used: `import retwin` loads no torch.
-_HOME = {
-    "ActuatorBias": "twins.faults",
-    "Additive": "update.corrections",
-    "CNN": "nets.networks",
-    "Case": "cases.case",
-    "Chain": "update.corrections",
-    "Channels": "data.trajectories",
-    "Choice": "evaluation",
-    "CommandSpace": "update.corrections",
-    "Context": "update.corrections",
-    "CorrectedTwin": "update.corrected",
-    "Correction": "update.corrections",
-    "DANN": "diagnosis",
-    "DelayOffset": "update.corrections",
-    "Diagnoser": "diagnosis",
-    "Discrepancy": "update.corrections",
-    "FMUTwin": "twins.fmu",
-    "Fault": "twins.faults",
-    "FineTune": "diagnosis",
-    "Flow": "update.residual",
-    "FunctionTwin": "twins.function",
-    "InputError": "errors",
-    "LSTM": "nets.networks",
-    "LSTMClassifier": "nets.networks",
-    "Limits": "twins.limits",
-    "MLP": "nets.networks",
-    "Mixture": "update.residual",
-    "MuJoCoTwin": "twins.mujoco",
-    "NetworkDiagnoser": "diagnosis",
-    "Parameter": "twins.parametric",
-    "ParametricTwin": "twins.parametric",
-    "Refinement": "update.residual",
-    "ResidualModel": "update.residual",
-    "Rocket": "diagnosis",
-    "SampledSensor": "update.corrections",
-    "Segments": "data.segments",
-    "SequenceMixture": "update.residual",
-    "SimulationError": "twins.collected",
-    "StateSpace": "nets.networks",
-    "Stuck": "twins.faults",
-    "StudyData": "study",
-    "StudyPlan": "study",
-    "Surrogate": "update.surrogate",
-    "TCN": "nets.networks",
-    "Training": "nets.training",
-    "Trajectories": "data.trajectories",
-    "Twin": "twins.twin",
-    "evaluate": "evaluation.diagnosers",
-    "export_actuator": "deploy.actuator.export",
-    "fetch": "data.download",
-    "fit": "evaluation",
-    "fit_diagnoser": "diagnosis",
-    "fit_inversion": "diagnosis",
-    "fit_residual": "update.residual",
-    "fit_surrogate": "update.surrogate",
-    "generate": "update.corrected",
-    "identify": "update.identification",
-    "infer_discrepancy": "update.residual",
-    "load": "data.io",
-    "load_diagnoser": "diagnosis",
-    "load_twin": "update.loading",
-    "measure_fidelity": "evaluation.fidelity",
-    "next_experiments": "evaluation.experiments.propose",
-    "run_study": "study",
-    "save": "data.io",
-    "score_model": "evaluation",
-    "write_report": "report",
-}
-
-# The rooms that users reach as `rt.<room>`.
-_ROOMS = (
-    "cases",
-    "data",
-    "deploy",
-    "diagnosis",
-    "evaluation",
-    "monitor",
-    "nets",
-    "report",
-    "scores",
-    "study",
-    "testing",
-    "twins",
-    "update",
+_HOME = homes(
+    {
+        "cases.case": "Case",
+        "data.download": "fetch",
+        "data.io": "load save",
+        "data.segments": "Segments",
+        "data.trajectories": "Channels Trajectories",
+        "deploy.actuator.export": "export_actuator",
+        "diagnosis": "DANN Diagnoser FineTune NetworkDiagnoser Rocket fit_diagnoser fit_inversion "
+        "load_diagnoser",
+        "errors": "InputError",
+        "evaluation": "Choice fit score_model",
+        "evaluation.diagnosers": "evaluate",
+        "evaluation.experiments.propose": "next_experiments",
+        "evaluation.fidelity": "measure_fidelity",
+        "nets.networks": "CNN LSTM LSTMClassifier MLP StateSpace TCN",
+        "nets.training": "Training",
+        "report": "write_report",
+        "study": "StudyData StudyPlan run_study",
+        "twins.collected": "SimulationError",
+        "twins.faults": "ActuatorBias Fault Stuck",
+        "twins.fmu": "FMUTwin",
+        "twins.function": "FunctionTwin",
+        "twins.limits": "Limits",
+        "twins.mujoco": "MuJoCoTwin",
+        "twins.parametric": "Parameter ParametricTwin",
+        "twins.twin": "Twin",
+        "update.corrected": "CorrectedTwin generate",
+        "update.corrections": "Additive Chain CommandSpace Context Correction DelayOffset "
+        "Discrepancy SampledSensor",
+        "update.identification": "identify",
+        "update.loading": "load_twin",
+        "update.residual": "Flow Mixture Refinement ResidualModel SequenceMixture fit_residual "
+        "infer_discrepancy",
+        "update.surrogate": "Surrogate fit_surrogate",
+    }
 )
 
-__all__ = ["__version__", *_ROOMS, *sorted(_HOME)]
+# The rooms that users reach as `rt.<room>`.
+_ROOMS = tuple(
+    homes(
+        {
+            "": "cases data deploy diagnosis evaluation monitor nets report scores study testing "
+            "twins update"
+        }
+    )
+)
+
+__all__ = ["__version__", *_ROOMS, *_HOME]
 __getattr__, __dir__, _ = names("retwin", _HOME)
 
 if TYPE_CHECKING:

@@ -245,6 +245,11 @@ def held(values: NDArray, axis: int) -> NDArray:
     return np.moveaxis(np.take_along_axis(moved, index, axis=0), 0, axis)
 
 
+def runs(flags: NDArray) -> NDArray:
+    """First index of each run of true flags (n,), and the index after its last one: (k, 2)."""
+    return np.flatnonzero(np.diff(flags.astype(int), prepend=0, append=0)).reshape(-1, 2)
+
+
 def is_finite(values: NDArray) -> bool:
     """Whether the sum of all is finite, from which it follows that each is."""
     with np.errstate(over="ignore", invalid="ignore"):

@@ -66,31 +66,16 @@ __all__ = [
 OPENED_CASE = "retwin.cases:get"
 """The function from the name of a case to the case, for models that name the case of their twin."""
 CASES: Mapping[str, CaseEntry] = {
-    "armpi": CaseEntry(
-        "retwin.cases.armpi_fpv.case:armpi",
-        "ArmPi FPV robot arm",
-        "retwin.cases.armpi_fpv.recorded:RECORDED",
-    ),
-    "tanks": CaseEntry(
-        "retwin.cases.cascaded_tanks.case:tanks",
-        "two cascaded tanks, without overflow",
-        "retwin.cases.cascaded_tanks.recorded:RECORDED",
-    ),
-    "tanks_overflow": CaseEntry(
-        "retwin.cases.cascaded_tanks.case:tanks_overflow",
-        "two cascaded tanks that overflow",
-        "retwin.cases.cascaded_tanks.recorded:RECORDED",
-    ),
-    "silverbox": CaseEntry(
-        "retwin.cases.silver_box.case:silverbox",
-        "Silverbox, a linear twin of a cubic spring",
-        "retwin.cases.silver_box.recorded:RECORDED",
-    ),
-    "incubator": CaseEntry(
-        "retwin.cases.styrofoam_incubator.case:incubator",
-        "incubator, a heater in a box of styrofoam",
-        "retwin.cases.styrofoam_incubator.recorded:RECORDED",
-    ),
+    name: CaseEntry(
+        f"retwin.cases.{room}.case:{name}", title, f"retwin.cases.{room}.recorded:RECORDED"
+    )
+    for name, room, title in (
+        ("armpi", "armpi_fpv", "ArmPi FPV robot arm"),
+        ("tanks", "cascaded_tanks", "two cascaded tanks, without overflow"),
+        ("tanks_overflow", "cascaded_tanks", "two cascaded tanks that overflow"),
+        ("silverbox", "silver_box", "Silverbox, a linear twin of a cubic spring"),
+        ("incubator", "styrofoam_incubator", "incubator, a heater in a box of styrofoam"),
+    )
 }
 """The built-in cases, by the names that `retwin.cases.get` and the command line take."""
 
@@ -110,13 +95,9 @@ TWINS: Mapping[str, Entry] = {
         "retwin.cases.styrofoam_incubator.twin:INCUBATOR",
         "incubator, a heater and the air in a box",
     ),
-    "silverbox": Entry(
-        "retwin.cases.silver_box.twin:SILVERBOX",
-        "Silverbox, a linear oscillator",
-    ),
+    "silverbox": Entry("retwin.cases.silver_box.twin:SILVERBOX", "Silverbox, a linear oscillator"),
     "tanks": Entry(
-        "retwin.cases.cascaded_tanks.twin:TANKS",
-        "two cascaded tanks, the upper level hidden",
+        "retwin.cases.cascaded_tanks.twin:TANKS", "two cascaded tanks, the upper level hidden"
     ),
 }
 """Targets are twins, or make one when they are called without arguments."""
@@ -300,152 +281,110 @@ NEEDS: Mapping[Need, Sequence[Need]] = {
 }
 """The jobs that must be done before those that sources need."""
 
+_BY = "retwin.study.sources:"
+"""The module of the functions by which a source is made."""
 SOURCES: Mapping[str, SourceEntry] = {
     "dt": SourceEntry(
-        "Original twin",
-        "none",
-        diagnoser="retwin.study.sources:recorded_twin",
-        recorded=True,
-        role="plain",
+        "Original twin", "none", diagnoser=_BY + "recorded_twin", recorded=True, role="plain"
     ),
     "twin": SourceEntry(
-        "Original twin",
-        "none",
-        twin="retwin.study.sources:plain_twin",
-        simulates=True,
-        role="plain",
+        "Original twin", "none", twin=_BY + "plain_twin", simulates=True, role="plain"
     ),
     "randomised": SourceEntry(
-        "Randomised twin", "none", twin="retwin.study.sources:randomised_twin", parametric=True
+        "Randomised twin", "none", twin=_BY + "randomised_twin", parametric=True
     ),
     "ibg": SourceEntry(
-        "Surrogate only",
-        "timing",
-        (_SURROGATE,),
-        twin="retwin.study.sources:surrogate_alone",
-        role="surrogate",
+        "Surrogate only", "timing", (_SURROGATE,), twin=_BY + "surrogate_alone", role="surrogate"
     ),
     "dt_noise": SourceEntry(
-        "Surrogate with output noise",
-        "healthy",
-        (_SURROGATE,),
-        twin="retwin.study.sources:noisy_surrogate",
+        "Surrogate with output noise", "healthy", (_SURROGATE,), twin=_BY + "noisy_surrogate"
     ),
     "pi_ls": SourceEntry(
         "Identified twin (least squares)",
         "healthy",
         (_LEAST_SQUARES,),
-        twin="retwin.study.sources:least_squares_twin",
+        twin=_BY + "least_squares_twin",
         parametric=True,
     ),
     "pi_bayes": SourceEntry(
         "Identified twin (Bayesian)",
         "healthy",
         (_BAYES,),
-        twin="retwin.study.sources:posterior_twin",
+        twin=_BY + "posterior_twin",
         parametric=True,
         extra="bayes",
     ),
     "dann": SourceEntry(
         "Domain-adversarial network",
         "unlabelled",
-        diagnoser="retwin.study.sources:adversarial",
+        diagnoser=_BY + "adversarial",
         recorded=True,
         network=True,
     ),
     "dann_transductive": SourceEntry(
         "Domain-adversarial network (uses test outputs)",
         "transductive",
-        diagnoser="retwin.study.sources:adversarial_transductive",
+        diagnoser=_BY + "adversarial_transductive",
         recorded=True,
         network=True,
     ),
     "mean_corrected": SourceEntry(
-        "Updated twin (mean only)",
-        "healthy",
-        (_SURROGATE, _OUTPUT),
-        twin="retwin.study.sources:mean_corrected",
+        "Updated twin (mean only)", "healthy", (_SURROGATE, _OUTPUT), twin=_BY + "mean_corrected"
     ),
     "ibg_rg": SourceEntry(
         "Updated twin (outputs)",
         "healthy",
         (_SURROGATE, _OUTPUT),
-        twin="retwin.study.sources:output_corrected",
+        twin=_BY + "output_corrected",
         role="updated",
     ),
     "pi_ls_rg": SourceEntry(
         "Identified, then updated twin (outputs)",
         "healthy",
         (_IDENTIFIED, _IDENTIFIED_OUTPUT),
-        twin="retwin.study.sources:identified_corrected",
+        twin=_BY + "identified_corrected",
         parametric=True,
         simulates=True,
     ),
     "dynamics": SourceEntry(
-        "Updated twin (dynamics)",
-        "healthy",
-        (_DYNAMICS,),
-        twin="retwin.study.sources:corrected_dynamics",
+        "Updated twin (dynamics)", "healthy", (_DYNAMICS,), twin=_BY + "corrected_dynamics"
     ),
     "fit": SourceEntry(
-        "Updated twin (chosen by its calibration)",
-        "healthy",
-        twin="retwin.study.sources:chosen",
-        simulates=True,
+        "Updated twin (chosen by its calibration)", "healthy", twin=_BY + "chosen", simulates=True
     ),
-    "arx": SourceEntry(
-        "Linear model (ARX)",
-        "healthy",
-        (("update", "arx"),),
-        twin="retwin.study.sources:black_box",
-        simulates=True,
-    ),
-    "narx": SourceEntry(
-        "Polynomial model (NARX)",
-        "healthy",
-        (("update", "narx"),),
-        twin="retwin.study.sources:black_box",
-        simulates=True,
-    ),
-    "neural_ss": SourceEntry(
-        "Neural state-space model",
-        "healthy",
-        (("update", "neural_ss"),),
-        twin="retwin.study.sources:black_box",
-        simulates=True,
-    ),
-    "lstm": SourceEntry(
-        "LSTM",
-        "healthy",
-        (("update", "lstm"),),
-        twin="retwin.study.sources:black_box",
-        simulates=True,
-    ),
+    **{
+        name: SourceEntry(
+            title, "healthy", (("update", name),), twin=_BY + "black_box", simulates=True
+        )
+        for name, title in (
+            ("arx", "Linear model (ARX)"),
+            ("narx", "Polynomial model (NARX)"),
+            ("neural_ss", "Neural state-space model"),
+            ("lstm", "LSTM"),
+        )
+    },
     "ibg_rg_command": SourceEntry(
         "Updated twin (command space)",
         "healthy",
         (_SURROGATE, _COMMAND),
-        twin="retwin.study.sources:command_corrected",
+        twin=_BY + "command_corrected",
         role="updated",
     ),
     "fine_tuned": SourceEntry(
         "Classifier fine-tuned on labelled faults",
         "labelled",
         (_SURROGATE, _COMMAND, ("diagnosis", "ibg_rg_command")),
-        diagnoser="retwin.study.sources:fine_tuned",
+        diagnoser=_BY + "fine_tuned",
         network=True,
     ),
     "inversion": SourceEntry(
-        "Physics inversion",
-        "healthy",
-        (_SURROGATE, _COMMAND),
-        diagnoser="retwin.study.sources:inversion",
+        "Physics inversion", "healthy", (_SURROGATE, _COMMAND), diagnoser=_BY + "inversion"
     ),
     "inversion_dynamics": SourceEntry(
         "Physics inversion (dynamics)",
         "healthy",
         (_DYNAMICS,),
-        diagnoser="retwin.study.sources:inversion_dynamics",
+        diagnoser=_BY + "inversion_dynamics",
     ),
     "inversion_cnn": SourceEntry(
         "Physics inversion with classifier", "healthy", pool=("inversion", "ibg_rg_command")

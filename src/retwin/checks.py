@@ -7,7 +7,7 @@ check has a default. `require` states what no other check covers.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable, Sized
+from collections.abc import Iterable, Sequence, Sized
 from math import inf, isfinite
 from numbers import Integral, Real
 from types import ModuleType
@@ -160,6 +160,33 @@ def at_least(argument: str, values: Sized, least: int, what: str, *, remedy: str
 def at_most(argument: str, count: int, most: int, what: str, *, remedy: str) -> None:
     """Require no more than `most` of something, which `what` names in the plural."""
     require(count <= most, argument, expected=f"at most {most} {what}", got=count, remedy=remedy)
+
+
+def nothing(argument: str, found: Iterable[object], expected: str, *, remedy: str) -> None:
+    """Require that nothing was found; the message lists what was."""
+    listed = [str(each) for each in found]
+    require(not listed, argument, expected=expected, got=", ".join(listed), remedy=remedy)
+
+
+def same_names(
+    argument: str, names: Iterable[str], wanted: Iterable[str], what: str, *, remedy: str
+) -> None:
+    """Require the names that `wanted` has, each once, in any order; `what` stands before them."""
+    names, wanted = list(names), list(wanted)
+    require(
+        sorted(names) == sorted(wanted),
+        argument,
+        expected=f"{what} {', '.join(wanted)}",
+        got=", ".join(names) or "none",
+        remedy=remedy,
+    )
+
+
+def ends_in(argument: str, path: object, suffixes: Sequence[str], *, remedy: str) -> None:
+    """Require the name of a file to end in one of some suffixes, in small letters or capitals."""
+    expected = f"a name that ends in {' or '.join(suffixes)}"
+    fits = str(path).lower().endswith(tuple(suffixes))
+    require(fits, argument, expected=expected, got=path, remedy=remedy)
 
 
 def existing(

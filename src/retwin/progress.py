@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
+
+Item = TypeVar("Item")
 
 Progress = Callable[[float], None]
 """Called with the share of the work that is done, from 0 to 1."""
@@ -21,3 +24,11 @@ class ResumedStage(str):
     """The name of a stage that goes on where it stopped: its share was done before."""
 
     __slots__ = ()
+
+
+def tracked(items: Iterable[Item], count: int, progress: Progress | None) -> Iterator[Item]:
+    """The items, of which there are so many; after each, the share that is done is reported."""
+    for done, item in enumerate(items, 1):
+        yield item
+        if progress is not None:
+            progress(done / count)

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 import retwin as rt
 from retwin.cases.animation import animate
-from retwin.cases.animation.offscreen import mujoco_pictures
 from retwin.cases.animation.shots import Shots
+from retwin.cases.animation.solid import mujoco_pictures
 from retwin.cases.armpi_fpv.body import ArmBody
 from retwin.cli.animate import animate as command
 from retwin.data.io import save
@@ -154,7 +154,7 @@ def test_an_updated_twin_is_in_the_film(
     assert green(shown[0]) > 20
     assert green(shown[-1]) > 2 * green(shown[0]), "the veil is gone at the end"
     assert (film("c.gif", updated=Offset(case.twin), seed=1)[-1] != shown[-1]).any()
-    with pytest.raises(InputError, match="updated: expected a twin with the rate 100"):
+    with pytest.raises(InputError, match=r"updated\.rate: expected that of the trajectory, 100"):
         film("d.gif", updated=Offset(case.twin, rate=50.0))
     with pytest.raises(InputError, match="from 320x240 to"):
         animate(short, case, tmp_path / "d.gif", size=(160, 160), updated=Offset(case.twin))

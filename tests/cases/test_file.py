@@ -126,7 +126,7 @@ components = 2
 training = { max_epochs = 5 }
 refinement = { draws = 4 }
 [training]
-epochs = 3
+max_epochs = 3
 decay = "step"
 [parameters.gain]
 unit = "m/V"
@@ -303,7 +303,7 @@ def test_a_function_of_records_is_checked(read: Callable[..., rt.Case], tmp_path
         ),
         (
             "foreign",
-            r"case\.toml: records .* expected Trajectories of a, b, y at 10 Hz, got a, a at",
+            r"case\.toml: records .*\.inputs: expected that of the twin, a .*, b .*, got a",
         ),
     ]:
         case = read(f'records = "toy_module:{name}"\n' + BASE)
@@ -331,7 +331,7 @@ density = { kind = "SequenceMixture", members = 3, network = { kind = "LSTM", hi
             {"steps": 500, "mean": (0.1, 1.0), "corner": 2},
         ),
         (
-            "low = [0, 1]\nhigh = [1, 2]\nmovements = 3\nsteps = 60\nramps = [8, 12]",
+            "low = [0, 1]\nhigh = [1, 2]\nsegments = 3\nduration = 6\nramp_durations = [0.8, 1.2]",
             {"low": (0.0, 1.0), "segments": 3, "duration": 6.0, "ramp_durations": (0.8, 1.2)},
         ),
     ],
@@ -510,7 +510,7 @@ def test_a_urdf_gets_servos(read: Callable[..., rt.Case], tmp_path: Path) -> Non
 name = "one"
 rate = 50
 outputs = ["arm"]
-commands = { low = [-1], high = [1], steps = 50, movements = 1, ramps = [10] }
+commands = { low = [-1], high = [1], duration = 1, segments = 1, ramp_durations = [0.2] }
 twin = { name = "one.urdf", servos = { hip = { stiffness = 50, damping = 4 } }, step = 0.002 }
 """
     case = read(keys)

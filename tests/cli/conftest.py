@@ -47,7 +47,7 @@ inputs = { first = { unit = "rad", low = -1, high = 1 }, second = { low = -1, hi
 outputs = { far = { unit = "m" }, high = { unit = "m" } }
 commands = { duration = 9, segments = 3, ramp_durations = [0.8, 1.0] }
 network = { kind = "MLP", hidden = [32] }
-training = { max_epochs = 20, batch = 64, rate = 1e-2 }
+training = { max_epochs = 20, batch_size = 64, learning_rate = 1e-2 }
 density = { kind = "Mixture", training = { max_epochs = 10, decay = "step" } }
 [faults]
 stuck = { kind = "Stuck", actuator = "second", onset = 1.2 }
@@ -62,7 +62,7 @@ outputs = { level = { unit = "m" } }
 commands = { kind = "HoldSampler", duration = 100, hold_durations = [5, 30] }
 correction = "additive"
 network = { kind = "StateSpace", states = 2, hidden = 8 }
-training = { max_epochs = 10, batch = 4, rate = 1e-2 }
+training = { max_epochs = 10, batch_size = 4, learning_rate = 1e-2 }
 [density]
 kind = "SequenceMixture"
 members = 2

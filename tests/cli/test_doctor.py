@@ -12,20 +12,17 @@ import pytest
 
 from retwin.catalog import EXTRAS
 from retwin.cli import doctor
-from retwin.cli.doctor import FOR_DEVELOPERS, Check, examine
-from retwin.errors import InputError
-from retwin.serialisation.files import sha256
+from retwin.cli.doctor import Check, examine
 
+FOR_DEVELOPERS = {"dev", "docs"}
 STATES = {"ok", "warning", "missing", "broken"}
-BACKEND = "retwin.cases.animation.offscreen.offscreen_backend"
 
 
 @pytest.fixture
 def healthy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPatch:
-    """A machine without data of its own, where drawing is not tried."""
+    """A machine without data of its own."""
     monkeypatch.setenv("RETWIN_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("RETWIN_DATA", raising=False)
-    monkeypatch.setattr(BACKEND, lambda: "egl")
     return monkeypatch
 
 
@@ -47,12 +44,12 @@ def test_this_very_machine(call, options: tuple[str, ...]) -> None:
     assert printed.keys() == {"ok", "checks"}
     assert printed["ok"] is True
     for each in printed["checks"]:
-        assert each.keys() == {"group", "name", "state", "found", "remedy"}
+        assert each.keys() == {"name", "state", "found", "remedy"}
         assert each["state"] in STATES - {"broken"}
         assert (each["state"] == "ok") == (each["remedy"] == ""), each
     names = [each["name"] for each in printed["checks"]]
     assert len(names) == len(set(names))
-    assert {"Python", "torch", "mujoco", "cores", "memory", "GPU", "rendering", *EXTRAS} < {*names}
+    assert {"Python", "torch", "mujoco", "cores", "memory", "GPU", *EXTRAS} < {*names}
     found = {each["name"]: each["found"] for each in printed["checks"]}
     assert found["torch"].startswith(metadata.version("torch"))
     assert ("not loaded" in found["torch"]) == (not options)
@@ -61,7 +58,7 @@ def test_this_very_machine(call, options: tuple[str, ...]) -> None:
 
 def test_every_extra_is_explained() -> None:
     extras = metadata.metadata("retwin").get_all("Provides-Extra") or []
-    assert set(extras) - set(FOR_DEVELOPERS) == set(EXTRAS)
+    assert set(extras) - FOR_DEVELOPERS == set(EXTRAS)
 
 
 def test_a_screen_of_80_columns_says_what_to_do(
@@ -76,9 +73,8 @@ def test_a_screen_of_80_columns_says_what_to_do(
     assert code == 0
     assert max(map(len, out.splitlines())) <= 80
     whole = " ".join(out.split())
-    assert re.search(r"warning flows .*zuko is 0.1, and must be .* → pip install", whole)
-    last = whole.rpartition("retwin works on this machine. Not found, and optional: ")[2]
-    assert re.search(r"RETWIN_DATA, .*\. \d warnings? above\.$", last)
+    assert re.search(r"missing flows .*zuko is 0.1, and must be .* → pip install", whole)
+    assert whole.endswith("retwin works on this machine.")
     assert not (tmp_path / "cache").exists(), "nothing is changed"
 
 
@@ -98,7 +94,7 @@ def test_what_is_needed_and_missing_is_broken(call, healthy: pytest.MonkeyPatch)
     assert re.search(
         r'missing scale .*dask is not installed → pip install "retwin\[scale\]"', whole
     )
-    assert "1 broken: retwin cannot work like this" in whole
+    assert "broken: jinja2; retwin cannot work like this" in whole
 
 
 @pytest.mark.slow
@@ -116,24 +112,11 @@ def test_a_library_that_does_not_load(healthy: pytest.MonkeyPatch, tmp_path: Pat
 
 def test_a_library_that_hangs(healthy: pytest.MonkeyPatch) -> None:
     healthy.setattr(doctor, "IMPORT_TIMEOUT", 0.0)
-    check = doctor._loaded("numpy")
-    assert (check.state, check.found) == ("broken", "no end after 0 s")
+    assert doctor._run("import numpy") == ("", "no end after 0 s")
 
 
-def test_a_machine_that_cannot_draw(healthy: pytest.MonkeyPatch) -> None:
-    def cannot() -> str:
-        raise InputError("renderer", expected="OpenGL", got="none", remedy="install EGL")
-
-    healthy.setattr(BACKEND, cannot)
-    check = found("rendering")
-    assert (check.state, check.found, check.remedy) == (
-        "missing", "films are stick figures: none", "install EGL",
-    )  # fmt: skip
-
-
-def test_a_container_is_not_the_whole_machine(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_few_cores_and_little_memory(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name, text in {
-        "cpu.max": "100000 100000",
         "memory.max": str(2**29),
         "memory.current": str(2**28),
     }.items():
@@ -141,7 +124,7 @@ def test_a_container_is_not_the_whole_machine(healthy: pytest.MonkeyPatch, tmp_p
     healthy.setattr("retwin.serialisation.sizes.CGROUP", tmp_path)
     healthy.setenv("OMP_NUM_THREADS", "64")
     assert found("cores").state == "warning"
-    assert "OMP_NUM_THREADS=1" in found("cores").remedy
+    assert "OMP_NUM_THREADS=" in found("cores").remedy
     memory = found("memory")
     assert (memory.state, memory.found) == ("warning", "0.2 GB free of 0.5")
     assert "--processes 1" in memory.remedy
@@ -150,29 +133,13 @@ def test_a_container_is_not_the_whole_machine(healthy: pytest.MonkeyPatch, tmp_p
 def test_data_that_are_found(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert found("RETWIN_DATA").state == "missing"
     healthy.setenv("RETWIN_DATA", str(tmp_path / "data"))
-    assert "no such folder" in found("RETWIN_DATA").found
-    (tmp_path / "data" / "arm").mkdir(parents=True)
-    assert found("RETWIN_DATA").state == "warning"
-    (tmp_path / "data" / "arm" / "real.mat").write_bytes(b"x")
+    assert "data: demo" in found("RETWIN_DATA").found
+    (tmp_path / "data").mkdir()
     assert found("RETWIN_DATA").state == "ok"
-    assert "arm/real.mat" in found("RETWIN_DATA").found
-
-
-def test_public_data_that_were_fetched(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
     ((name, known),) = doctor.DOWNLOADS.items()
     check = found(f"public {name}")
     assert (check.state, check.remedy) == ("missing", f"retwin data fetch {name}")
     file = tmp_path / "cache" / known.file
     file.parent.mkdir(parents=True)
     file.write_bytes(b"x")
-    assert found(f"public {name}").state == "warning"
-    right = type(known)(known.url, sha256(file), known.file)
-    healthy.setattr(doctor, "DOWNLOADS", {name: right})
     assert found(f"public {name}").state == "ok"
-
-
-def test_a_cache_that_cannot_be_written(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"")
-    healthy.setenv("RETWIN_CACHE", str(tmp_path / "file" / "below"))
-    check = found("cache")
-    assert (check.state, "RETWIN_CACHE" in check.remedy) == ("warning", True)

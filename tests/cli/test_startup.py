@@ -34,8 +34,8 @@ atexit.register(report)
 FACTOR = 12.0
 """Greatest processor time of a command, in multiples of a bare import, which takes 0.14 s.
 
-Most take 2 to 3; `doctor`, which starts a process that draws, takes 5; a command that imports torch
-takes 20 and more. The rest is room for a busy machine, on which both times vary.
+Most take 2 to 3; a command that imports torch takes
+20 and more. The rest is room for a busy machine, on which both times vary.
 """
 
 

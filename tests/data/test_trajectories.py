@@ -242,7 +242,7 @@ def test_concatenate_joins_and_renumbers_only_when_ids_repeat():
 def test_concatenate_refuses_sets_that_differ(name, other):
     with pytest.raises(InputError) as caught:
         Trajectories.concatenate([make(), make(**other)])
-    assert caught.value.argument == name
+    assert caught.value.argument == f"sets.{name}"
 
 
 def test_concatenate_pads_shorter_sets():

@@ -127,7 +127,7 @@ inputs = { target = { unit = "rad", low = -1, high = 1 } }
 outputs = { angle = { unit = "rad" }, torque = { unit = "N m" } }
 commands = { duration = 4, segments = 2, ramp_durations = [0.8, 1.0] }
 network = { kind = "MLP", hidden = [8] }
-training = { max_epochs = 5, batch = 64, rate = 1e-2 }
+training = { max_epochs = 5, batch_size = 64, learning_rate = 1e-2 }
 density = { kind = "Mixture", training = { max_epochs = 2, decay = "step" } }
 """
 

@@ -238,7 +238,7 @@ def test_names_may_be_anything(version: str, tmp_path: Path) -> None:
 def test_what_cannot_be_exported_is_refused(corrected: DynamicsTwin, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="splines"):
         export_fmu(tank("spline"), tmp_path / "t.fmu")
-    with pytest.raises(InputError, match=r"\*\.fmu"):
+    with pytest.raises(InputError, match=r"ends in \.fmu"):
         export_fmu(corrected, tmp_path / "t.zip")
     with pytest.raises(InputError, match="version"):
         export_fmu(corrected, tmp_path / "t.fmu", version="1.0")

@@ -46,7 +46,7 @@ inputs = { first = { low = -1, high = 1 }, second = { unit = "m", low = -1, high
 outputs = { far = { unit = "m" }, high = { unit = "m" } }
 commands = { duration = 6, segments = 2, ramp_durations = [0.8, 1.0] }
 network = { kind = "MLP", hidden = [8] }
-training = { max_epochs = 2, batch = 64, rate = 1e-2 }
+training = { max_epochs = 2, batch_size = 64, learning_rate = 1e-2 }
 density = { kind = "Mixture", training = { max_epochs = 2, decay = "step" } }
 [faults]
 stuck = { kind = "Stuck", actuator = "second", onset = 1.2 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import fields, replace
 
 import numpy as np
@@ -310,22 +309,6 @@ def test_evidence_is_the_mean_of_two_models(
     found = [each.watch(leaking()) for each in (once, twice)]
     np.testing.assert_allclose(found[1].evidence, found[0].evidence, rtol=1e-9)
     assert [each.time for each in found[0].alarms] == [each.time for each in found[1].alarms]
-
-
-@pytest.mark.slow
-def test_a_monitor_that_was_saved_with_one_model_opens(
-    twin: DynamicsTwin, tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("retwin.monitor.fitting._slower", lambda *_: [])
-    made = fit_monitor(twin, record(2, 1), "1 per hour")
-    made.save(tmp_path / "monitor")
-    (file,) = (tmp_path / "monitor").glob("*.json")
-    about = json.loads(file.read_text())
-    assert about.pop("predictors") == [[1.0, made.warm_up]]
-    file.write_text(json.dumps({**about, "warm_up": made.warm_up}))
-    again = Monitor.load(tmp_path / "monitor")
-    assert next(iter(again.start(1).arrays())) == "filter.states"
-    np.testing.assert_array_equal(again.watch(leaking()).evidence, made.watch(leaking()).evidence)
 
 
 def test_slack_is_widened_where_the_calibration_contradicts_it() -> None:

@@ -18,7 +18,7 @@ from small import PLAN, small_case
 
 import retwin as rt
 from retwin.scores.classification import METRICS
-from retwin.study import possible_sources
+from retwin.study import _check_free, possible_sources
 from retwin.study.files import Files, Job, Roles
 from retwin.study.trial import SEES, Trial
 from retwin.study.work import Work
@@ -151,6 +151,12 @@ def test_another_study_in_the_same_folder_is_refused(
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(rt.InputError, match="holds other files"):
         rt.run_study(case, PLAN, rt.StudyData(), tmp_path)
+
+
+def test_a_study_of_another_version_is_not_resumed(tmp_path: Path) -> None:
+    (tmp_path / "study.json").write_text('{"retwin": "0.0.9", "plan": {}}', encoding="utf-8")
+    with pytest.raises(rt.InputError, match=r"begun by another version of retwin 0\.0\.9"):
+        _check_free(tmp_path, {"plan": {}, "case": "a"})
 
 
 def test_calibration_and_test_sets_keep_their_roles(

@@ -10,7 +10,7 @@ from typing import Protocol
 from numpy.typing import NDArray
 
 from retwin.cases.recorded import RecordedCase
-from retwin.checks import one_of, require
+from retwin.checks import agree, nothing, one_of, require
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.nets.networks import MLP, Network
 from retwin.nets.training import Training
@@ -142,11 +142,12 @@ class Case(OfTwin):
     causes: Mapping[str, Fault] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require(
-            self.sampler.rate == self.rate,
+        agree(
             "sampler",
-            expected=f"commands at the rate of the twin, {self.rate:g} Hz",
-            got=f"{self.sampler.rate:g} Hz",
+            self.sampler,
+            self,
+            "that of the twin",
+            names=("rate",),
             remedy="give both the same rate",
         )
         require(
@@ -166,13 +167,8 @@ class Case(OfTwin):
         for name in self.dynamics.states:
             one_of("dynamics.states", name, state_names(self.twin) or (name,))
         twice = [name for name in self.causes if name in self.faults]
-        require(
-            not twice,
-            "causes",
-            expected="names that no fault has",
-            got=", ".join(twice),
-            remedy="the faults are causes of alarms already: leave them out",
-        )
+        remedy = "the faults are causes of alarms already: leave them out"
+        nothing("causes", twice, "names that no fault has", remedy=remedy)
         for fault in self.faults.values():
             if isinstance(fault, Stuck | TimedFault):
                 fault.onset_range(self.sampler.steps, self.rate)

@@ -20,7 +20,7 @@ from retwin.cases.based_on import merged, parameters_of, updated_built_in
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.named_twin import delayed_twin, imported, parametric_twin, read_twin
-from retwin.checks import one_of, require
+from retwin.checks import agree, one_of, require
 from retwin.data.io import load
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -112,9 +112,7 @@ def read_case(path: str | Path) -> Case:
         return updated_built_in(home, settings, place)
     named = (catalog.CORRECTIONS, catalog.DENSITIES, catalog.NETWORKS)
     kinds = [kind for entries in named for kind in catalog.classes(entries)]
-    rate = settings.get("rate")
-    rate = rate if isinstance(rate, int | float) else None
-    keys = from_settings(CaseFile, settings, kinds, place=place, rate=rate)
+    keys = from_settings(CaseFile, settings, kinds, place=place)
     folder = home / keys.folder
     with at(key(place, "folder")):
         real_path(folder)
@@ -298,15 +296,13 @@ def _sampler(
     settings = {"kind": RampSampler.__name__, "rate": twin.rate, **value}
     if settings["kind"] == RecordedSampler.__name__:
         options = {name: v for name, v in settings.items() if name not in ("kind", "file")}
-        own_settings = checked(
-            RecordedSampler, options, place=place, besides=("commands",), rate=twin.rate
-        )
+        own_settings = checked(RecordedSampler, options, place=place, besides=("commands",))
         commands = _recorded(settings, twin, records, folder, place)
         with at(place):
             return RecordedSampler(commands, **own_settings)
     if limits is not None:
         settings = {"low": limits.low, "high": limits.high, **settings}
-    return from_config(settings, SAMPLERS, place=place, rate=twin.rate)
+    return from_config(settings, SAMPLERS, place=place)
 
 
 def _recorded(
@@ -328,13 +324,8 @@ def _recorded(
             found, _ = records(path)
         else:
             found = load(path)
-    require(
-        (found.inputs, found.rate) == (twin.inputs, twin.rate),
-        key(place, "file"),
-        expected=f"commands of {', '.join(twin.inputs.names)} at {twin.rate:g} Hz",
-        got=f"{', '.join(found.inputs.names) or 'none'} at {found.rate:g} Hz",
-        remedy="take data of this system",
-    )
+    names, remedy = ("inputs", "rate"), "take data of this system"
+    agree(key(place, "file"), found, twin, "that of the twin", names=names, remedy=remedy)
     return found.commands
 
 
@@ -377,13 +368,7 @@ def _checked_split(
         remedy="return (calibration, test)",
     )
     for each in made:
-        require(
-            (each.inputs, each.outputs, each.rate) == (twin.inputs, twin.outputs, twin.rate),
-            place,
-            expected=f"Trajectories of {', '.join(twin.inputs.names + twin.outputs.names)} at "
-            f"{twin.rate:g} Hz",
-            got=f"{', '.join(each.inputs.names + each.outputs.names)} at {each.rate:g} Hz",
-            remedy="give them the channels and the rate of the twin",
-        )
+        remedy = "give them the channels and the rate of the twin"
+        agree(place, each, twin, "that of the twin", remedy=remedy)
     calibration, test = made
     return calibration, test

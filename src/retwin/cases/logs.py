@@ -27,7 +27,7 @@ from retwin.data.logs.mapping import NO_NOMINAL, TimeSettings, read_mapping
 from retwin.data.logs.reading import is_log, read_log
 from retwin.data.logs.signals import Clock, Log
 from retwin.data.trajectories import Trajectories
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.serialisation.sizes import Budget
 from retwin.twins.twin import Twin
 
@@ -223,12 +223,10 @@ class LogReader:
         self._check_columns(twin)
         notes: dict[str, list[str]] = {}
         sets, tests = [], []
-        for done, path in enumerate(map(Path, paths)):
+        for path in tracked(map(Path, paths), len(paths), progress):
             own, test = self._of_log(path, twin, case, notes, rows_at_rate=rows_at_rate)
             sets.append(own)
             tests += test
-            if progress is not None:
-                progress((done + 1) / len(paths))
         joined = usable(Trajectories.concatenate(sets), notes, self.columns.transient)
         kept = Trajectories.concatenate(tests) if tests else None
         return Logs(joined, kept, tuple(_sentences(notes)))

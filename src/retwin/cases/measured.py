@@ -6,7 +6,7 @@ import numpy as np
 
 from retwin.checks import require
 from retwin.data.measured import stand_ins
-from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 
 LARGEST = 1e30
@@ -49,7 +49,7 @@ def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -
 
 def _healthy(found: Trajectories, notes: dict[str, list[str]]) -> Trajectories:
     """The healthy and the unlabelled trajectories; InputError if there is none."""
-    kept = np.isin(found.labels, (HEALTHY, UNLABELLED))
+    kept = found.maybe_healthy
     require(
         kept.any(),
         "logs",

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from retwin import twins
-from retwin.checks import existing, require
+from retwin.checks import existing, nothing, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.modules import import_beside
@@ -130,13 +130,8 @@ def read_twin(
     found = imported(name, folder, own) if ":" in name else None
     if callable(found) and (inputs or outputs):
         return _of_function(found, inputs, outputs, rate, options, place)
-    require(
-        not options,
-        own,
-        expected="a name alone, for such a twin has its own settings",
-        got=", ".join(options),
-        remedy="make the object with these settings",
-    )
+    expected = "a name alone, for such a twin has its own settings"
+    nothing(own, options, expected, remedy="make the object with these settings")
     with at(place):
         return twins.get(name, inputs=tuple(inputs), outputs=tuple(outputs), rate=rate)
 

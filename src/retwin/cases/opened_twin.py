@@ -13,7 +13,7 @@ from retwin import catalog, twins
 from retwin.cases.case import Case
 from retwin.cases.file import read_case
 from retwin.cases.named_twin import parametric_twin
-from retwin.checks import require
+from retwin.checks import nothing, require
 from retwin.errors import InputError
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.fmu_model import adjustable, read_description
@@ -127,13 +127,9 @@ def open_parametric(
     """
     case = _case(name)
     if case is not None:
-        require(
-            not inputs and not outputs and rate is None,
-            "inputs, outputs, rate",
-            expected="none of them, since the case has its own",
-            got=", ".join([*inputs, *outputs, *([f"{rate:g} Hz"] if rate else [])]),
-            remedy="leave them out",
-        )
+        given = (*inputs, *outputs, *([f"{rate:g} Hz"] if rate is not None else []))
+        expected = "none of them, since the case has its own"
+        nothing("inputs, outputs, rate", given, expected, remedy="leave them out")
         twin: Twin = case.parametric or case.twin
     else:
         twin = twins.get(name, inputs=tuple(inputs), outputs=tuple(outputs), rate=rate)
@@ -255,13 +251,8 @@ def _freed(twin: Twin, chosen: Sequence[Parameter]) -> ParametricTwin:
     elif isinstance(twin.twin, StateTwin):
         own = set(twin.twin.names)
     unknown = [each.name for each in made.parameters if own is not None and set(each.places) - own]
-    require(
-        not unknown,
-        "--free",
-        expected=f"some of {', '.join(twin.names)}",
-        got=", ".join(unknown),
-        remedy="declare it among the parameters of the case or of the twin",
-    )
+    remedy = "declare it among the parameters of the case or of the twin"
+    nothing("--free", unknown, f"some of {', '.join(twin.names)}", remedy=remedy)
     return made
 
 

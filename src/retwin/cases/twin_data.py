@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from retwin import cases, catalog, twins
-from retwin.checks import require
+from retwin.checks import nothing, require
 from retwin.data.io import DataCase
 from retwin.data.logs.mapping import Mapping, read_mapping
 from retwin.data.trajectories import Channels, Trajectories
@@ -82,13 +82,8 @@ def log_case(
     """
     is_file = Path(name).suffix.lower() in FILES
     if not is_file and (":" not in name or _is_case(name)):
-        require(
-            not inputs and not outputs,
-            "inputs, outputs",
-            expected="none of them, since the case has its own",
-            got=", ".join([*inputs, *outputs]),
-            remedy="leave them out",
-        )
+        expected = "none of them, since the case has its own"
+        nothing("inputs, outputs", (*inputs, *outputs), expected, remedy="leave them out")
         return cases.data_case(name)
     if is_file:
         twin = twins.get(name, inputs=inputs, outputs=outputs)

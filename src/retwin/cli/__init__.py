@@ -35,6 +35,7 @@ from retwin.cli import (
     twins,
 )
 from retwin.cli.commands import Commands, Group
+from retwin.cli.options import option
 from retwin.cli.terminal import (
     BAD_INPUT,
     FAILED,
@@ -102,15 +103,16 @@ app.add_typer(monitor.app, name="monitor")
 
 @app.callback(invoke_without_command=True)
 def options(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    version: Annotated[bool, option("", "Print the version and exit.", "--version")] = False,
     quiet: Annotated[
         bool,
-        typer.Option(
+        option(
+            "",
+            "No progress, no notes: only results.",
             "--quiet",
             "-q",
             envvar="RETWIN_QUIET",
             show_envvar=False,
-            help="No progress, no notes: only results.",
         ),
     ] = False,
 ) -> None:

@@ -7,10 +7,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from retwin.checks import given
-from retwin.cli.options import CaseOption, Seed
+from retwin.cli.options import CaseOption, Seed, argument, option
 from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, bar
 
@@ -24,25 +22,16 @@ class Renderer(StrEnum):
 
 
 def animate(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File or folder of trajectories.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The film, *.mp4 or *.gif.")],
+    file: Annotated[Path, argument("FILE", "File or folder of trajectories.")],
+    out: Annotated[Path, option("FILE", "The film, *.mp4 or *.gif.")],
     case: CaseOption = "armpi",
-    name: Annotated[
-        str | None, typer.Option("--id", metavar="ID", help="Which trajectory, by its id.")
-    ] = None,
-    index: Annotated[
-        int, typer.Option(metavar="N", min=0, help="Which trajectory, by its place.")
-    ] = 0,
-    fps: Annotated[float, typer.Option(metavar="HZ", help="Pictures per second.")] = 25.0,
-    size: Annotated[
-        str, typer.Option(metavar="WxH", help="Width and height in pixels.")
-    ] = "640x480",
-    renderer: Annotated[
-        Renderer, typer.Option(help="What draws; auto: the best here.")
-    ] = Renderer.auto,
+    name: Annotated[str | None, option("ID", "Which trajectory, by its id.", "--id")] = None,
+    index: Annotated[int, option("N", "Which trajectory, by its place.", min=0)] = 0,
+    fps: Annotated[float, option("HZ", "Pictures per second.")] = 25.0,
+    size: Annotated[str, option("WxH", "Width and height in pixels.")] = "640x480",
+    renderer: Annotated[Renderer, option("", "What draws; auto: the best here.")] = Renderer.auto,
     model: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="A corrected twin, whose band is shown as well."),
+        Path | None, option("FOLDER", "A corrected twin, whose band is shown as well.")
     ] = None,
     seed: Seed = 0,
 ) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from retwin.checks import require
 from retwin.cli.commands import Commands
 from retwin.cli.diagnose import EMULATED, diagnoses, write_probabilities
@@ -22,6 +20,8 @@ from retwin.cli.options import (
     Probabilities,
     Real,
     Seed,
+    argument,
+    option,
 )
 from retwin.cli.reading import case_named, data_case, read, saved, updated_twin
 from retwin.cli.terminal import answer, bar, command_given, example, note, table
@@ -37,17 +37,15 @@ app = Commands(
     epilog=example("retwin bundle predict bundle real.mat --case armpi"),
 )
 
-Folder = Annotated[Path, typer.Argument(metavar="BUNDLE", help="Folder of a bundle.")]
+Folder = Annotated[Path, argument("BUNDLE", "Folder of a bundle.")]
 
 
 @app.command(epilog=example("retwin bundle save model real.mat --diagnoser cnn --out bundle"))
 def save(
     model: Model,
     real: Real,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the bundle.")],
-    diagnoser: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Folder of a diagnoser.")
-    ] = None,
+    out: Annotated[Path, option("FOLDER", "Where to save the bundle.")],
+    diagnoser: Annotated[Path | None, option("FOLDER", "Folder of a diagnoser.")] = None,
     case: OtherCase = None,
     seed: Seed = 0,
     mapping: LogMapping = None,
@@ -107,10 +105,7 @@ def verify(folder: Folder, as_json: Json = False) -> None:
 
 @app.command(epilog=example("retwin bundle predict bundle real.mat --case armpi"))
 def predict(
-    folder: Annotated[
-        Path,
-        typer.Argument(metavar="BUNDLE", help="Folder of a bundle, or of its ONNX export."),
-    ],
+    folder: Annotated[Path, argument("BUNDLE", "Folder of a bundle, or of its ONNX export.")],
     file: Measured,
     case: CaseOption = None,
     out: Probabilities = None,
@@ -154,7 +149,7 @@ def predict(
 @app.command(epilog=example("retwin bundle generate bundle --out made.npz"))
 def generate(
     folder: Folder,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="New *.npz or *.zarr.")],
+    out: Annotated[Path, option("FILE", "New *.npz or *.zarr.")],
     per_class: PerClass = 400,
     case: OtherCase = None,
     seed: Seed = 0,
@@ -180,7 +175,7 @@ def generate(
 @app.command(epilog=example("retwin bundle export bundle --onnx portable"))
 def export(
     folder: Folder,
-    onnx: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to put the ONNX graphs.")],
+    onnx: Annotated[Path, option("FOLDER", "Where to put the ONNX graphs.")],
     as_json: Json = False,
 ) -> None:
     """Write ONNX graphs, with which `bundle predict` needs no torch."""

@@ -7,10 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from rich.table import Table
 
-from retwin.checks import require
+from retwin.checks import ends_in, nothing, require
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_files
 from retwin.cli.options import (
@@ -22,8 +21,10 @@ from retwin.cli.options import (
     Outputs,
     Rate,
     Seed,
+    argument,
     case_option,
     channel_names,
+    option,
 )
 from retwin.cli.reading import data_case, read
 from retwin.cli.terminal import answer, bar, example, note, table
@@ -47,9 +48,7 @@ app = Commands(
     epilog=example("retwin data info real.mat --case armpi"),
 )
 
-File = Annotated[
-    Path, typer.Argument(metavar="FILE", help="File or folder of trajectories.", show_default=False)
-]
+File = Annotated[Path, argument("FILE", "File or folder of trajectories.", show_default=False)]
 
 ChannelsOf = Annotated[
     str | None,
@@ -59,9 +58,7 @@ ChannelsOf = Annotated[
 
 @app.command(epilog=example("retwin data info real.mat sim.mat --case armpi"))
 def info(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILES", help="Files or folders of trajectories.")
-    ],
+    files: Annotated[list[Path], argument("FILES", "Files or folders of trajectories.")],
     case: ChannelsOf = None,
     rate: Rate = None,
     mapping: LogMapping = None,
@@ -82,19 +79,12 @@ def info(
 
 @app.command("map", epilog=example("retwin data map run.mcap --case armpi --out mapping.toml"))
 def map_log(
-    log: Annotated[
-        Path, typer.Argument(metavar="LOG", help="ROS bag, MCAP, Parquet, TDMS, MDF, CSV, …")
-    ],
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="New mapping.toml; its picture beside.")
-    ],
+    log: Annotated[Path, argument("LOG", "ROS bag, MCAP, Parquet, TDMS, MDF, CSV, …")],
+    out: Annotated[Path, option("FILE", "New mapping.toml; its picture beside.")],
     case: ChannelsOf = None,
-    time: Annotated[
-        str, typer.Option("--time", metavar="COLUMN", help="Column of the times, if not found.")
-    ] = "",
+    time: Annotated[str, option("COLUMN", "Column of the times, if not found.", "--time")] = "",
     rate: Annotated[
-        float | None,
-        typer.Option("--rate", metavar="HZ", help="Rows per second, if it has no times."),
+        float | None, option("HZ", "Rows per second, if it has no times.", "--rate")
     ] = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
@@ -107,13 +97,7 @@ def map_log(
     from retwin.data.logs.proposal import propose_mapping
     from retwin.report.log_picture import log_picture
 
-    require(
-        out.suffix.lower() == ".toml",
-        "--out",
-        expected="a name that ends in .toml",
-        got=out,
-        remedy="give another name, such as mapping.toml",
-    )
+    ends_in("--out", out, (".toml",), remedy="give another name, such as mapping.toml")
     picture = out.with_suffix(".png")
     for place in (out, picture):
         check_place(place)
@@ -154,8 +138,8 @@ def map_log(
 
 @app.command(epilog=example("retwin data convert sim.mat sim.npz --case armpi"))
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="File or folder to read.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="New *.npz or *.zarr.")],
+    source: Annotated[Path, argument("IN", "File or folder to read.")],
+    target: Annotated[Path, argument("OUT", "New *.npz or *.zarr.")],
     case: CaseOption = None,
     rate: Rate = None,
     mapping: LogMapping = None,
@@ -171,13 +155,9 @@ def convert(
 @app.command(epilog=example("retwin data split real.npz --out-first fit.npz --out-second test.npz"))
 def split(
     file: File,
-    first: Annotated[
-        Path, typer.Option("--out-first", metavar="FILE", help="First part, *.npz or *.zarr.")
-    ],
-    second: Annotated[
-        Path, typer.Option("--out-second", metavar="FILE", help="The rest, *.npz or *.zarr.")
-    ],
-    fraction: Annotated[float, typer.Option(metavar="X", help="Share of the first part.")] = 0.6,
+    first: Annotated[Path, option("FILE", "First part, *.npz or *.zarr.", "--out-first")],
+    second: Annotated[Path, option("FILE", "The rest, *.npz or *.zarr.", "--out-second")],
+    fraction: Annotated[float, option("X", "Share of the first part.")] = 0.6,
     seed: Seed = 0,
     case: CaseOption = None,
     rate: Rate = None,
@@ -205,21 +185,15 @@ def split(
 def fetch(
     name: Annotated[
         str,
-        typer.Argument(
-            metavar="NAME",
-            help="Name of a public data file, such as armpi.",
-            autocompletion=complete_files,
+        argument(
+            "NAME", "Name of a public data file, such as armpi.", autocompletion=complete_files
         ),
     ],
     folder: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Else RETWIN_CACHE, else the user's cache.",
-        ),
+        Path | None, option("FOLDER", "Else RETWIN_CACHE, else the user's cache.")
     ] = None,
     max_bytes: Annotated[
-        int, typer.Option(metavar="N", help="Most that the file may hold.", min=1)
+        int, option("N", "Most that the file may hold.", min=1)
     ] = download.MAX_BYTES,
 ) -> None:
     """Download a public data file, check its SHA-256 and print its path."""
@@ -236,13 +210,9 @@ def _channels_of(
     """What files need of the case or the twin of that name, if one is given."""
     names = [channel_names(each) for each in (inputs, outputs)]
     if name is None:
-        require(
-            not any(names),
-            "--inputs, --outputs",
-            expected="the twin to which they belong, --case plant.fmu or module:function",
-            got=", ".join([*names[0], *names[1]]),
-            remedy="give --case too, or leave them out",
-        )
+        expected = "the twin to which they belong, --case plant.fmu or module:function"
+        remedy = "give --case too, or leave them out"
+        nothing("--inputs, --outputs", (*names[0], *names[1]), expected, remedy=remedy)
         return None
     if Path(name).suffix.lower() not in FILES and ":" not in name and not any(names):
         return data_case(name)

@@ -8,14 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
 from retwin import catalog
 from retwin.checks import require
 from retwin.cli.commands import Commands
-from retwin.cli.completion import one_of
-from retwin.cli.options import CaseOption, Json, LogMapping, MaxBytes, Measured, Probabilities, Seed
+from retwin.cli.options import (
+    CaseOption,
+    Json,
+    LogMapping,
+    MaxBytes,
+    Measured,
+    Probabilities,
+    Seed,
+    argument,
+    option,
+)
 from retwin.cli.reading import case_named, data_case, read, saved, updated_twin
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import Trajectories
@@ -33,23 +41,18 @@ app = Commands(
     epilog=example("retwin diagnose predict cnn real.mat --case armpi"),
 )
 
-Out = Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the diagnoser.")]
+Out = Annotated[Path, option("FOLDER", "Where to save the diagnoser.")]
 
 
 @app.command(epilog=example("retwin diagnose fit made.npz --classifier cnn --out cnn"))
 def fit(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Labelled trajectories.")],
+    file: Annotated[Path, argument("FILE", "Labelled trajectories.")],
     out: Out,
     classifier: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help="cnn, lstm or rocket.", autocompletion=one_of(catalog.CLASSIFIERS)
-        ),
+        str, option("NAME", "cnn, lstm or rocket.", names=catalog.CLASSIFIERS)
     ] = "cnn",
     case: CaseOption = None,
-    rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Sample rate of the features.")
-    ] = None,
+    rate: Annotated[float | None, option("HZ", "Sample rate of the features.")] = None,
     seed: Seed = 0,
     mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
@@ -79,20 +82,13 @@ def fit(
 
 @app.command(epilog=example("retwin diagnose invert model real.mat --out physics"))
 def invert(
-    model: Annotated[
-        Path,
-        typer.Argument(metavar="MODEL", help="A corrected twin, in command space or of dynamics."),
-    ],
+    model: Annotated[Path, argument("MODEL", "A corrected twin, in command space or of dynamics.")],
     out: Out,
     real: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[REAL]", help="What it was calibrated on; corrected dynamics need none."
-        ),
+        Path | None, argument("[REAL]", "What it was calibrated on; corrected dynamics need none.")
     ] = None,
     random_onset: Annotated[
-        bool,
-        typer.Option("--random-onset", help="Infer the onset of stuck motors."),
+        bool, option("", "Infer the onset of stuck motors.", "--random-onset")
     ] = False,
     mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
@@ -126,7 +122,7 @@ def invert(
 
 @app.command(epilog=example("retwin diagnose predict cnn real.mat --case armpi"))
 def predict(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a diagnoser.")],
+    model: Annotated[Path, argument("MODEL", "Folder of a diagnoser.")],
     file: Measured,
     case: CaseOption = None,
     out: Probabilities = None,

@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
-
 from retwin.checks import require
 from retwin.cli.commands import Commands
-from retwin.cli.options import Json, OtherCase, Seed, channel_names
+from retwin.cli.options import Json, OtherCase, Seed, argument, channel_names, option
 from retwin.cli.reading import system_of, updated_twin
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.errors import InputError
@@ -32,16 +30,11 @@ app = Commands(
 
 @app.command(epilog=example("retwin export fmu model --out twin.fmu --version 3.0"))
 def fmu(
-    model: Annotated[
-        Path, typer.Argument(metavar="MODEL", help="Folder of an updated twin, of retwin fit.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The FMU to write, *.fmu.")],
-    version: Annotated[
-        Literal["2.0", "3.0"], typer.Option(metavar="FMI", help="Version of FMI: 2.0 or 3.0.")
-    ] = "2.0",
+    model: Annotated[Path, argument("MODEL", "Folder of an updated twin, of retwin fit.")],
+    out: Annotated[Path, option("FILE", "The FMU to write, *.fmu.")],
+    version: Annotated[Literal["2.0", "3.0"], option("FMI", "Version of FMI: 2.0 or 3.0.")] = "2.0",
     source_only: Annotated[
-        bool,
-        typer.Option("--source-only", help="Write no binary for this machine."),
+        bool, option("", "Write no binary for this machine.", "--source-only")
     ] = False,
     case: OtherCase = None,
     as_json: Json = False,
@@ -81,17 +74,14 @@ def fmu(
 
 @app.command(epilog=example("retwin export actuator model --out actuator --period 0.005"))
 def actuator(
-    model: Annotated[
-        Path, typer.Argument(metavar="MODEL", help="Folder of a corrected twin, of retwin fit.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
+    model: Annotated[Path, argument("MODEL", "Folder of a corrected twin, of retwin fit.")],
+    out: Annotated[Path, option("DIR", "The folder to write.")],
     period: Annotated[
-        float | None,
-        typer.Option(metavar="S", help="Seconds between two steps; else the sample period."),
+        float | None, option("S", "Seconds between two steps; else the sample period.")
     ] = None,
-    draws: Annotated[int, typer.Option(metavar="N", help="Draws of the discrepancy.")] = 16384,
+    draws: Annotated[int, option("N", "Draws of the discrepancy.")] = 16384,
     torchscript_only: Annotated[
-        bool, typer.Option("--torchscript-only", help="Write no ONNX graph.")
+        bool, option("", "Write no ONNX graph.", "--torchscript-only")
     ] = False,
     case: OtherCase = None,
     seed: Seed = 0,
@@ -120,20 +110,15 @@ def actuator(
 
 @app.command(epilog=example("retwin export actuator-net model --joint u,angle,torque --out net.pt"))
 def actuator_net(
-    model: Annotated[
-        Path, typer.Argument(metavar="MODEL", help="Folder of an updated twin, of retwin fit.")
-    ],
+    model: Annotated[Path, argument("MODEL", "Folder of an updated twin, of retwin fit.")],
     joint: Annotated[
         list[str],
-        typer.Option(
-            metavar="NAMES",
-            help="Channels TARGET,POSITION,TORQUE[,VELOCITY]. Repeat it for equal actuators.",
+        option(
+            "NAMES", "Channels TARGET,POSITION,TORQUE[,VELOCITY]. Repeat it for equal actuators."
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The network to write, *.pt.")],
-    history: Annotated[
-        str, typer.Option(metavar="STEPS", help="Into the past, joined by commas.")
-    ] = "0,1,2",
+    out: Annotated[Path, option("FILE", "The network to write, *.pt.")],
+    history: Annotated[str, option("STEPS", "Into the past, joined by commas.")] = "0,1,2",
     case: OtherCase = None,
     seed: Seed = 0,
     as_json: Json = False,

@@ -6,12 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
-import typer
-
 from retwin import catalog
 from retwin.checks import existing, one_of, positive, require
 from retwin.cli.completion import complete_twins
-from retwin.cli.completion import one_of as completing
 from retwin.cli.options import (
     TWIN,
     Inputs,
@@ -20,7 +17,9 @@ from retwin.cli.options import (
     MaxBytes,
     Outputs,
     Seed,
+    argument,
     channel_names,
+    option,
 )
 from retwin.cli.terminal import answer, bar, command_given, note, table
 from retwin.serialisation.places import check_place
@@ -37,69 +36,52 @@ UNRATED = (".fmu", ".xml", ".urdf")
 """Suffixes of twins that take any sample rate."""
 
 
-def _panel(name: str, *flags: str, **more: Any) -> Any:
-    return typer.Option(*flags, rich_help_panel=name, **more)
+def _panel(name: str, *described: str, **more: Any) -> Any:
+    return option(*described, rich_help_panel=name, **more)
 
 
 TwinName = Annotated[
     str,
-    typer.Argument(
-        metavar="TWIN",
-        help="plant.fmu, robot.xml, module:function, case.toml or a built-in case.",
+    argument(
+        "TWIN",
+        "plant.fmu, robot.xml, module:function, case.toml or a built-in case.",
         autocompletion=complete_twins,
     ),
 ]
-LogFiles = Annotated[
-    list[Path], typer.Argument(metavar="LOG…", help="Tables *.csv, or what rt.load reads.")
-]
-Out = Annotated[Path, typer.Option(metavar="FOLDER", help="Where the results go.")]
+LogFiles = Annotated[list[Path], argument("LOG…", "Tables *.csv, or what rt.load reads.")]
+Out = Annotated[Path, option("FOLDER", "Where the results go.")]
 Free = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME=LOW:HIGH", help="A free parameter, or NAME=LOW:HIGH:START."),
+    list[str] | None, option("NAME=LOW:HIGH", "A free parameter, or NAME=LOW:HIGH:START.")
 ]
 MethodName = Annotated[
     str,
-    typer.Option(
-        "--method",
-        metavar="NAME",
-        help="least_squares, evolution, bayes or npe.",
-        autocompletion=completing(catalog.IDENTIFICATIONS),
+    option(
+        "NAME", "least_squares, evolution, bayes or npe.", "--method", names=catalog.IDENTIFICATIONS
     ),
 ]
-HoldOut = Annotated[
-    float | None, typer.Option(metavar="X", help="Share held out for validation; else 0.25.")
-]
-Loss = Annotated[
-    str | None, _panel("Method", metavar="NAME", help="soft_l1 (default), linear or cauchy.")
-]
+HoldOut = Annotated[float | None, option("X", "Share held out for validation; else 0.25.")]
+Loss = Annotated[str | None, _panel("Method", "NAME", "soft_l1 (default), linear or cauchy.")]
 Starts = Annotated[
-    int | None, _panel("Method", metavar="N", help="Starts of the search; else 4.", min=1, max=1000)
+    int | None, _panel("Method", "N", "Starts of the search; else 4.", min=1, max=1000)
 ]
-SensorRate = Annotated[
-    float | None, _panel("Method", metavar="HZ", help="True rate of the sensor, if lower.")
-]
+SensorRate = Annotated[float | None, _panel("Method", "HZ", "True rate of the sensor, if lower.")]
 Horizon = Annotated[
     str,
     _panel(
         "Method",
-        metavar="SECONDS",
-        help="Windows whose starts are estimated, or free for whole records; else chosen.",
+        "SECONDS",
+        "Windows whose starts are estimated, or free for whole records; else chosen.",
     ),
 ]
-Processes = Annotated[int, _panel("Method", metavar="N", help="Worker processes.", min=1, max=256)]
+Processes = Annotated[int, _panel("Method", "N", "Worker processes.", min=1, max=256)]
 Column = Annotated[
-    list[str] | None,
-    _panel("Logs", metavar="CHANNEL=NAME", help="The column of a channel, if named otherwise."),
+    list[str] | None, _panel("Logs", "CHANNEL=NAME", "The column of a channel, if named otherwise.")
 ]
 Time = Annotated[
-    str | None, _panel("Logs", metavar="NAME", help="Column of the times; or NAME=ms, us, ns, iso.")
+    str | None, _panel("Logs", "NAME", "Column of the times; or NAME=ms, us, ns, iso.")
 ]
-Transient = Annotated[
-    float, _panel("Logs", metavar="SECONDS", help="Begin of each log that is not used.")
-]
-Rate = Annotated[
-    float | None, _panel(TWIN, metavar="HZ", help="Samples per second; else the log's.")
-]
+Transient = Annotated[float, _panel("Logs", "SECONDS", "Begin of each log that is not used.")]
+Rate = Annotated[float | None, _panel(TWIN, "HZ", "Samples per second; else the log's.")]
 
 
 def identify(
@@ -228,13 +210,13 @@ def _method(name: str, loss: str | None, starts: int | None) -> Any:
     if starts is not None:
         options["starts"] = starts
     taken = {"least_squares": ("loss", "starts"), "evolution": ("loss",), "bayes": ("starts",)}
-    for option in options:
-        methods = [each for each, names in taken.items() if option in names]
+    for given in options:
+        methods = [each for each, names in taken.items() if given in names]
         require(
             name in methods,
-            f"--{option}",
+            f"--{given}",
             expected=f"none with --method {name}",
-            got=options[option],
+            got=options[given],
             remedy=f"leave it out; {' and '.join(methods)} take it",
         )
     return catalog.resolve(catalog.IDENTIFICATIONS[name].target)(**options)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-import typer
 
 from retwin.checks import require
 from retwin.cli.options import (
@@ -21,6 +20,7 @@ from retwin.cli.options import (
     OtherCase,
     PerClass,
     Seed,
+    option,
     seconds_of,
 )
 from retwin.cli.plans import Workers, carry_out
@@ -37,15 +37,12 @@ if TYPE_CHECKING:
 
 def generate(
     model: Model,
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="New *.npz, or *.zarr of any size; *.csv of bands.")
-    ],
+    out: Annotated[Path, option("FILE", "New *.npz, or *.zarr of any size; *.csv of bands.")],
     commands: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Simulate these commands, in place of drawn ones."),
+        Path | None, option("FILE", "Simulate these commands, in place of drawn ones.")
     ] = None,
     bands: Annotated[
-        bool, typer.Option("--bands", help="Write mean, 5 % and 95 % quantile of --commands.")
+        bool, option("", "Write mean, 5 % and 95 % quantile of --commands.", "--bands")
     ] = False,
     per_class: PerClass = 400,
     case: OtherCase = None,
@@ -124,14 +121,10 @@ def write_predictions(found: ScoredPrediction, records: Trajectories, out: Path)
 
 def evaluate(
     model: Model,
-    real: Annotated[Path, typer.Option(metavar="FILE", help="Records it was not fitted to.")],
+    real: Annotated[Path, option("FILE", "Records it was not fitted to.")],
     horizon: Horizon = "free",
-    warm_up: Annotated[
-        str, typer.Option(metavar="TIME", help="Begin of each record that is not scored, as 5s.")
-    ] = "",
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="CSV file of predictions with bands.")
-    ] = None,
+    warm_up: Annotated[str, option("TIME", "Begin of each record that is not scored, as 5s.")] = "",
+    out: Annotated[Path | None, option("FILE", "CSV file of predictions with bands.")] = None,
     case: OtherCase = None,
     seed: Seed = 0,
     mapping: LogMapping = None,

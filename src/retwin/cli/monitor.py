@@ -20,19 +20,16 @@ import typer
 from retwin import catalog
 from retwin.checks import finite, positive, require
 from retwin.cli.commands import Commands
-from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase
+from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase, argument, option
 from retwin.cli.reading import case_named, read, saved
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
-from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
     from retwin.monitor import Alarm, Cause, Monitor, Watched
-
-UNEXPLAINED = 0.5
-"""Probability from which on it is printed that a cause does not explain all."""
 
 Reading = Callable[..., Trajectories]
 """`cli.reading.read` with the options of the command."""
@@ -45,23 +42,16 @@ app = Commands(
 
 @app.command(epilog=example("retwin monitor fit model healthy.npz --out watch"))
 def fit(
-    model: Annotated[
-        Path,
-        typer.Argument(metavar="MODEL", help="Corrected dynamics, or a diagnoser by inversion."),
-    ],
+    model: Annotated[Path, argument("MODEL", "Corrected dynamics, or a diagnoser by inversion.")],
     healthy: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="HEALTHY...", help="Healthy records, best not those it was fitted to."
-        ),
+        list[Path], argument("HEALTHY...", "Healthy records, best not those it was fitted to.")
     ],
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the monitor.")],
+    out: Annotated[Path, option("FOLDER", "Where to save the monitor.")],
     false_alarms: Annotated[
-        str,
-        typer.Option(metavar="RATE", help='At most: "1 per month", "2 per year", "1e-6 Hz".'),
+        str, option("RATE", 'At most: "1 per month", "2 per year", "1e-6 Hz".')
     ] = "1 per month",
     blanking: Annotated[
-        float | None, typer.Option(metavar="S", help="Time without alarms after an alarm: 60.")
+        float | None, option("S", "Time without alarms after an alarm: 60.")
     ] = None,
     case: OtherCase = None,
     mapping: LogMapping = None,
@@ -105,12 +95,8 @@ def fit(
 
 @app.command(epilog=example("retwin monitor replay watch day1.npz day2.npz"))
 def replay(
-    monitor: Annotated[
-        Path, typer.Argument(metavar="MONITOR", help="Folder of a monitor, of retwin monitor fit.")
-    ],
-    logs: Annotated[
-        list[Path], typer.Argument(metavar="LOG...", help="Records, in the order of time.")
-    ],
+    monitor: Annotated[Path, argument("MONITOR", "Folder of a monitor, of retwin monitor fit.")],
+    logs: Annotated[list[Path], argument("LOG...", "Records, in the order of time.")],
     case: OtherCase = None,
     mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
@@ -220,13 +206,9 @@ def _replay_trajectories(
 
 @app.command(epilog=example("retwin monitor demo --open"))
 def demo(
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, metavar="N", help="Of the page; 0 is any free one.")
-    ] = 8710,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", help="End by itself after this time.")
-    ] = None,
-    open_page: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
+    port: Annotated[int, option("N", "Of the page; 0 is any free one.", min=0, max=65535)] = 8710,
+    seconds: Annotated[float | None, option("S", "End by itself after this time.")] = None,
+    open_page: Annotated[bool, option("", "Open the page in a browser.", "--open")] = False,
     as_json: Json = False,
 ) -> None:
     """Show the live monitor with emulated incubators, of which some become faulty.
@@ -268,9 +250,9 @@ def demo(
 
 @app.command(epilog=example("retwin monitor run --config monitor.toml"))
 def run(
-    config: Annotated[
-        Path, typer.Option(metavar="FILE", help="Machines, twins and sources, as TOML.")
-    ] = Path("monitor.toml"),
+    config: Annotated[Path, option("FILE", "Machines, twins and sources, as TOML.")] = Path(
+        "monitor.toml"
+    ),
 ) -> None:
     """Watch running machines, until Ctrl-C or SIGTERM."""
     from retwin.monitor.program import run as watch
@@ -289,13 +271,9 @@ def run(
 
 @app.command(epilog=example("retwin monitor audit store"))
 def audit(
-    store: Annotated[
-        Path, typer.Argument(metavar="STORE", help="Folder of the store, or an exported log.")
-    ],
-    head: Annotated[
-        str | None, typer.Option(metavar="HASH", help="A former head that was kept elsewhere.")
-    ] = None,
-    url: Annotated[str, typer.Option(metavar="URL", help="The PostgreSQL database, if one.")] = "",
+    store: Annotated[Path, argument("STORE", "Folder of the store, or an exported log.")],
+    head: Annotated[str | None, option("HASH", "A former head that was kept elsewhere.")] = None,
+    url: Annotated[str, option("URL", "The PostgreSQL database, if one.")] = "",
     as_json: Json = False,
 ) -> None:
     """Verify the log of a store, and the files of its versions."""
@@ -329,9 +307,7 @@ def audit(
 
 def _healthy(record: Trajectories, file: Path) -> Trajectories:
     """The healthy trajectories of a file."""
-    if record.labels is None:
-        return record
-    chosen = record[[i for i, label in enumerate(record.labels) if label in (HEALTHY, "")]]
+    chosen = record[record.maybe_healthy]
     require(
         len(chosen) > 0,
         str(file),
@@ -358,11 +334,10 @@ def _causes(
 
 def _written(cause: Cause) -> str:
     """A cause with its onset, and whether there is more to it."""
-    from retwin.monitor.cause import cause_title
+    from retwin.monitor.cause import cause_text
 
-    since = "" if isnan(cause.onset[0]) else f" from {cause.onset[0]:.6g} s"
-    more = ", and more than that" if since and cause.unknown > UNEXPLAINED else ""
-    return f"{cause_title(cause.name)}{since}{more}"
+    since = "" if isnan(cause.onset[0]) else f"{cause.onset[0]:.6g} s"
+    return cause_text(cause.name, since, cause.unknown)
 
 
 def _summary(file: Path, record: Trajectories, watched: Watched) -> str:

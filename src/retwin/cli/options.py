@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -12,71 +13,80 @@ from retwin.catalog import CASES
 from retwin.checks import positive, whole
 from retwin.cli.completion import one_of
 
+
+def option(
+    metavar: str, text: str, *flags: str, names: Iterable[str] | None = None, **more: Any
+) -> Any:
+    """An option of a command.
+
+    Parameters
+    ----------
+    metavar : str
+        The name of its value in the help; "" for a flag.
+    text : str
+        What it does.
+    *flags : str
+        Its names; by default that of the parameter.
+    names : iterable of str, optional
+        Values to which a shell completes.
+    **more : object
+        Further parameters of `typer.Option`.
+
+    """
+    if names is not None:
+        more["autocompletion"] = one_of(names)
+    return typer.Option(*flags, metavar=metavar or None, help=text, **more)
+
+
+def argument(metavar: str, text: str, *, names: Iterable[str] | None = None, **more: Any) -> Any:
+    """An argument of a command; see `option`."""
+    if names is not None:
+        more["autocompletion"] = one_of(names)
+    return typer.Argument(metavar=metavar, help=text, **more)
+
+
 CASE = "Built-in case, case.toml, or module:object."
 case_option = partial(typer.Option, "--case", metavar="CASE", autocompletion=one_of(CASES))
 
-CaseArgument = Annotated[
-    str, typer.Argument(metavar="CASE", help=CASE, autocompletion=one_of(CASES))
-]
+CaseArgument = Annotated[str, argument("CASE", CASE, names=CASES)]
 CaseOption = Annotated[str | None, case_option(help=CASE)]
 OtherCase = Annotated[str | None, case_option(help="If another than it was fitted for.")]
-Model = Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a corrected twin.")]
-Real = Annotated[
-    Path, typer.Argument(metavar="REAL", help="The trajectories it was calibrated on.")
-]
-Measured = Annotated[
-    Path, typer.Argument(metavar="FILE", help="Trajectories; labels are not needed.")
-]
-Probabilities = Annotated[
-    Path | None,
-    typer.Option("--out", metavar="FILE", help="CSV file for all probabilities."),
-]
-PerClass = Annotated[int, typer.Option(metavar="N", help="Trajectories per class.")]
-Rate = Annotated[
-    float | None,
-    typer.Option("--rate", metavar="HZ", help="Samples per second, if the file has none."),
-]
+Model = Annotated[Path, argument("MODEL", "Folder of a corrected twin.")]
+Real = Annotated[Path, argument("REAL", "The trajectories it was calibrated on.")]
+Measured = Annotated[Path, argument("FILE", "Trajectories; labels are not needed.")]
+Probabilities = Annotated[Path | None, option("FILE", "CSV file for all probabilities.", "--out")]
+PerClass = Annotated[int, option("N", "Trajectories per class.")]
+Rate = Annotated[float | None, option("HZ", "Samples per second, if the file has none.", "--rate")]
 LogMapping = Annotated[
-    Path | None,
-    typer.Option("--mapping", metavar="FILE", help="For a log: what `retwin data map` wrote."),
+    Path | None, option("FILE", "For a log: what `retwin data map` wrote.", "--mapping")
 ]
 TWIN = "Twin"
 """The panel of help with the options of a twin that is no case."""
 Inputs = Annotated[
-    str,
-    typer.Option(
-        "--inputs", metavar="NAMES", help="Of the inputs, joined by commas.", rich_help_panel=TWIN
-    ),
+    str, option("NAMES", "Of the inputs, joined by commas.", "--inputs", rich_help_panel=TWIN)
 ]
 Outputs = Annotated[
-    str,
-    typer.Option(
-        "--outputs", metavar="NAMES", help="Of the outputs, joined by commas.", rich_help_panel=TWIN
-    ),
+    str, option("NAMES", "Of the outputs, joined by commas.", "--outputs", rich_help_panel=TWIN)
 ]
 MaxBytes = Annotated[
-    int | None,
-    typer.Option(metavar="N", help="Most that a file may hold; else by what is free.", min=1),
+    int | None, option("N", "Most that a file may hold; else by what is free.", min=1)
 ]
 MAX_SEED = 2**63 - 1
 """The largest seed that every generator of random numbers takes."""
 Seed = Annotated[
     int,
-    typer.Option(
+    option(
+        "N",
+        "Same seed, same result.",
         "--seed",
-        metavar="N",
-        help="Same seed, same result.",
         min=0,
         callback=lambda seed: whole("--seed", seed, most=MAX_SEED),
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead, and nothing else.")]
+Json = Annotated[bool, option("", "Print JSON instead, and nothing else.", "--json")]
 
 Horizon = Annotated[
-    str,
-    typer.Option(
-        "--horizon", metavar="TIME", help="Judge by predictions so far ahead, as 1s; or free."
-    ),
+    str, option("TIME", "Judge by predictions so far ahead, as 1s; or free.", "--horizon")
 ]
 
 

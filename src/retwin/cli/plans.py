@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from retwin.cli.options import option
 from retwin.cli.terminal import FAILED, bar, complain, note, resumable
 
 if TYPE_CHECKING:
     from retwin.deploy.simulations import SimulationPlan
 
-Workers = Annotated[
-    int | None, typer.Option(metavar="N", help="Processes for *.zarr; else one per core.", min=1)
-]
-Scheduler = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, in place of processes.")
-]
+Workers = Annotated[int | None, option("N", "Processes for *.zarr; else one per core.", min=1)]
+Scheduler = Annotated[str | None, option("ADDRESS", "Dask scheduler, in place of processes.")]
 
 
 def carry_out(

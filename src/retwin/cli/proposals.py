@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from retwin.cli.options import CaseArgument, Json, LogMapping, Model, Seed
+from retwin.cli.options import CaseArgument, Json, LogMapping, Model, Seed, option
 from retwin.cli.reading import case_named, read, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
@@ -19,15 +17,11 @@ if TYPE_CHECKING:
 def propose(
     case: CaseArgument,
     model: Model,
-    real: Annotated[
-        Path, typer.Option(metavar="FILE", help="The trajectories it was calibrated on.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The commands to send, *.npz.")],
-    count: Annotated[int, typer.Option(metavar="N", help="Trajectories to propose.")] = 3,
-    candidates: Annotated[int, typer.Option(metavar="N", help="Commands to choose from.")] = 200,
-    tolerance: Annotated[
-        float, typer.Option(metavar="X", help="Share by which bands may be too wide.")
-    ] = 0.05,
+    real: Annotated[Path, option("FILE", "The trajectories it was calibrated on.")],
+    out: Annotated[Path, option("FILE", "The commands to send, *.npz.")],
+    count: Annotated[int, option("N", "Trajectories to propose.")] = 3,
+    candidates: Annotated[int, option("N", "Commands to choose from.")] = 200,
+    tolerance: Annotated[float, option("X", "Share by which bands may be too wide.")] = 0.05,
     seed: Seed = 0,
     mapping: LogMapping = None,
     as_json: Json = False,

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import typer
 from rich.table import Table
 
 from retwin import catalog
 from retwin.checks import given
-from retwin.cli.completion import complete_sources, one_of
-from retwin.cli.options import CaseArgument, Json, LogMapping, Seed
+from retwin.cli.completion import complete_sources
+from retwin.cli.options import CaseArgument, Json, LogMapping, Seed, argument, option
 from retwin.cli.plans import Scheduler
 from retwin.cli.terminal import answer, bar, command_given, note, plain, resumable, table
 from retwin.progress import FinishedStage
@@ -36,82 +35,48 @@ DEMO_MINUTES = 4
 VERDICTS = {"better": "better", "worse": "worse", "open": "undecided"}
 """Outcomes of a comparison in words."""
 data_option, compared_option = (
-    partial(typer.Option, rich_help_panel=panel)
+    partial(option, rich_help_panel=panel)
     for panel in (
         "Data: either --real, or --calibration and --test, or --data",
         "What is compared",
     )
 )
 
-StudyFolder = Annotated[
-    Path,
-    typer.Option(metavar="FOLDER", help="Called again, the study goes on there."),
-]
-RealSet = Annotated[
-    Path | None, data_option(metavar="FILE", help="One real set, split into folds.")
-]
-Folds = Annotated[int, data_option(metavar="N", help="Folds of --real.")]
-CalibrationSet = Annotated[
-    Path | None, data_option(metavar="FILE", help="Real set to calibrate on.")
-]
-TestSet = Annotated[Path | None, data_option(metavar="FILE", help="Real set to test on.")]
-OneFile = Annotated[
-    Path | None, data_option(metavar="FILE", help="One file that the case splits itself.")
-]
-TwinSet = Annotated[
-    Path | None, data_option(metavar="FILE", help="Trajectories of the twin; else simulated.")
-]
+StudyFolder = Annotated[Path, option("FOLDER", "Called again, the study goes on there.")]
+RealSet = Annotated[Path | None, data_option("FILE", "One real set, split into folds.")]
+Folds = Annotated[int, data_option("N", "Folds of --real.")]
+CalibrationSet = Annotated[Path | None, data_option("FILE", "Real set to calibrate on.")]
+TestSet = Annotated[Path | None, data_option("FILE", "Real set to test on.")]
+OneFile = Annotated[Path | None, data_option("FILE", "One file that the case splits itself.")]
+TwinSet = Annotated[Path | None, data_option("FILE", "Trajectories of the twin; else simulated.")]
 Sources = Annotated[
     str | None,
     compared_option(
-        metavar="NAMES",
-        help="Joined by commas, or all; else dt (or twin), ibg, ibg_rg.",
+        "NAMES",
+        "Joined by commas, or all; else dt (or twin), ibg, ibg_rg.",
         autocompletion=complete_sources,
     ),
 ]
 Preset = Annotated[
     str,
-    compared_option(
-        metavar="NAME",
-        help="quick or paper: classifier, training, runs.",
-        autocompletion=one_of(catalog.PRESETS),
-    ),
+    compared_option("NAME", "quick or paper: classifier, training, runs.", names=catalog.PRESETS),
 ]
 Classifier = Annotated[
     str | None,
-    compared_option(
-        metavar="NAME",
-        help="cnn, lstm or rocket; else the preset's.",
-        autocompletion=one_of(catalog.CLASSIFIERS),
-    ),
+    compared_option("NAME", "cnn, lstm or rocket; else the preset's.", names=catalog.CLASSIFIERS),
 ]
-Runs = Annotated[int | None, compared_option(metavar="N", help="Runs; else the preset's.")]
-Rate = Annotated[
-    float | None,
-    compared_option(metavar="HZ", help="Rate of the features; else the sensor's."),
-]
-PerClass = Annotated[
-    int | None, compared_option(metavar="N", help="Generated trajectories; else the case's.")
-]
-CalibrateOn = Annotated[
-    str,
-    compared_option(
-        metavar="NAME", help="healthy or all.", autocompletion=one_of(catalog.CALIBRATE_ON)
-    ),
-]
+Runs = Annotated[int | None, compared_option("N", "Runs; else the preset's.")]
+Rate = Annotated[float | None, compared_option("HZ", "Rate of the features; else the sensor's.")]
+PerClass = Annotated[int | None, compared_option("N", "Generated trajectories; else the case's.")]
+CalibrateOn = Annotated[str, compared_option("NAME", "healthy or all.", names=catalog.CALIBRATE_ON)]
 RandomOnset = Annotated[
-    bool, compared_option("--random-onset", help="Draw the onset of stuck motors.")
+    bool, compared_option("", "Draw the onset of stuck motors.", "--random-onset")
 ]
-EncoderNoise = Annotated[
-    float, compared_option(metavar="X", help="Noise on frozen joints, in command units.")
-]
+EncoderNoise = Annotated[float, compared_option("X", "Noise on frozen joints, in command units.")]
 LearningCurve = Annotated[
-    bool,
-    compared_option("--learning-curve", help="Also calibrate on 1, 2, 4, 6 … healthy ones."),
+    bool, compared_option("", "Also calibrate on 1, 2, 4, 6 … healthy ones.", "--learning-curve")
 ]
-Processes = Annotated[
-    int | None, typer.Option(metavar="N", help="Jobs at a time; else one per core.")
-]
+Processes = Annotated[int | None, option("N", "Jobs at a time; else one per core.")]
 
 
 def study(
@@ -168,7 +133,7 @@ def study(
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(metavar="STUDY", help="Folder of a study.")],
+    folder: Annotated[Path, argument("STUDY", "Folder of a study.")],
 ) -> None:
     """Write the report page again from a study's results."""
     from retwin.report import write_report
@@ -179,13 +144,9 @@ def report(
 
 def demo(
     out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Else demo/real, or demo/emulated without real data.",
-        ),
+        Path | None, option("FOLDER", "Else demo/real, or demo/emulated without real data.")
     ] = None,
-    runs: Annotated[int, typer.Option(metavar="N", help="Runs.")] = 1,
+    runs: Annotated[int, option("N", "Runs.")] = 1,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:

@@ -6,15 +6,13 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from retwin import twins
 from retwin.catalog import CASES, TWINS
-from retwin.checks import given, require
+from retwin.checks import agree, given, require
 from retwin.cli.animate import animate
 from retwin.cli.commands import Commands
-from retwin.cli.completion import complete_faults, complete_twins, one_of
-from retwin.cli.options import Json, MaxBytes, Seed, channel_names
+from retwin.cli.completion import complete_faults, complete_twins
+from retwin.cli.options import Json, MaxBytes, Seed, argument, channel_names, option
 from retwin.cli.plans import Scheduler, Workers, carry_out
 from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, example, table
@@ -38,52 +36,29 @@ app = Commands(
 
 TwinName = Annotated[
     str,
-    typer.Argument(
-        metavar="TWIN",
-        help="See `retwin twin list`; or a saved model's folder.",
-        autocompletion=complete_twins,
+    argument(
+        "TWIN", "See `retwin twin list`; or a saved model's folder.", autocompletion=complete_twins
     ),
 ]
-Inputs = Annotated[str, typer.Option(metavar="NAMES", help="Of the inputs, joined by commas.")]
-Outputs = Annotated[str, typer.Option(metavar="NAMES", help="Of the outputs, joined by commas.")]
-Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Samples per second.", min=1e-9)]
+Inputs = Annotated[str, option("NAMES", "Of the inputs, joined by commas.")]
+Outputs = Annotated[str, option("NAMES", "Of the outputs, joined by commas.")]
+Rate = Annotated[float | None, option("HZ", "Samples per second.", min=1e-9)]
 
 RAMPS = 5
 """Ramps in a trajectory whose commands no case draws: enough to reach levels far apart."""
-NoMeshes = Annotated[
-    bool, typer.Option("--no-meshes", help="Leave out the meshes of a model file.")
-]
+NoMeshes = Annotated[bool, option("", "Leave out the meshes of a model file.", "--no-meshes")]
 Servos = Annotated[
-    list[str] | None,
-    typer.Option("--servo", metavar="JOINT=K,D", help="A servo for a joint of a URDF; repeatable."),
+    list[str] | None, option("JOINT=K,D", "A servo for a joint of a URDF; repeatable.", "--servo")
 ]
-Count = Annotated[
-    int | None,
-    typer.Option("--n", metavar="N", help="Else one per row of --commands, or class."),
-]
+Count = Annotated[int | None, option("N", "Else one per row of --commands, or class.", "--n")]
 CommandCase = Annotated[
-    str | None,
-    typer.Option(
-        metavar="CASE",
-        help="Source of commands and faults; else its own.",
-        autocompletion=one_of(CASES),
-    ),
+    str | None, option("CASE", "Source of commands and faults; else its own.", names=CASES)
 ]
-CommandFile = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Trajectories with the commands.")
-]
+CommandFile = Annotated[Path | None, option("FILE", "Trajectories with the commands.")]
 FaultName = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME",
-        help="A class, or all (dealt in turn), or none.",
-        autocompletion=complete_faults,
-    ),
+    str, option("NAME", "A class, or all (dealt in turn), or none.", autocompletion=complete_faults)
 ]
-Duration = Annotated[
-    float | None,
-    typer.Option(metavar="SECONDS", help="Of commands that no case draws.", min=1e-9),
-]
+Duration = Annotated[float | None, option("SECONDS", "Of commands that no case draws.", min=1e-9)]
 
 SHOWN = 100
 """Largest number of channels in a table: one of thousands takes minutes to lay out."""
@@ -170,7 +145,7 @@ def _ends(channel: dict[str, Any]) -> tuple[str, str]:
 @app.command(epilog=example("retwin twin simulate armpi --n 20000 --fault all --out made.zarr"))
 def simulate(
     twin: TwinName,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="New *.npz, or *.zarr of any size.")],
+    out: Annotated[Path, option("FILE", "New *.npz, or *.zarr of any size.")],
     n: Count = None,
     case: CommandCase = None,
     commands: CommandFile = None,
@@ -182,10 +157,10 @@ def simulate(
     servo: Servos = None,
     no_meshes: NoMeshes = False,
     seed: Seed = 0,
-    clip: Annotated[bool, typer.Option("--clip", help="Clip commands to the limits.")] = False,
+    clip: Annotated[bool, option("", "Clip commands to the limits.", "--clip")] = False,
     workers: Workers = None,
     scheduler: Scheduler = None,
-    chunk: Annotated[int, typer.Option(metavar="N", help="Trajectories per chunk.", min=1)] = 256,
+    chunk: Annotated[int, option("N", "Trajectories per chunk.", min=1)] = 256,
     max_bytes: MaxBytes = None,
 ) -> None:
     """Simulate trajectories to a file; an interrupted *.zarr is resumed."""
@@ -292,14 +267,8 @@ def _case(named: str | None, name: str, found: Twin) -> Case | None:
     if not (named or own):
         return None
     system = cases.get(named or own)
-    require(
-        (system.inputs, system.rate) == (found.inputs, found.rate),
-        "--case",
-        expected=f"a case with the twin's inputs, {', '.join(found.inputs.names)}, at "
-        f"{found.rate:g} Hz",
-        got=f"{system.name} with {', '.join(system.inputs.names)} at {system.rate:g} Hz",
-        remedy="name the case that this twin belongs to",
-    )
+    names, remedy = ("inputs", "rate"), "name the case that this twin belongs to"
+    agree("--case", system, found, "that of the twin", names=names, remedy=remedy)
     return system
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import check_finite, check_shapes, floating, measured, named, row_blocks
-from retwin.checks import at_least, require, whole
+from retwin.checks import agree, at_least, require, whole
 from retwin.data.provenance import Provenance
 from retwin.times import sample_rate, to_samples
 
@@ -274,6 +274,11 @@ class Trajectories:
         arrays = {name: getattr(self, name)[:, span] for name in PER_SAMPLE}
         return self.replace(**arrays)
 
+    @property
+    def maybe_healthy(self) -> NDArray:
+        """Which trajectories (n,) are labelled as healthy, or not labelled."""
+        return np.isin(self.labels, (HEALTHY, UNLABELLED))
+
     def with_label(self, label: str) -> Trajectories:
         """The trajectories of class `label`."""
         return self[self.labels == label]
@@ -370,16 +375,9 @@ class Trajectories:
 
         """
         at_least("sets", sets, 1, "set of trajectories", remedy="give the sets to join")
-        first = sets[0]
+        first, joining = sets[0], "resample or rename before joining"
         for other in sets[1:]:
-            for name in ("rate", "inputs", "outputs"):
-                require(
-                    getattr(other, name) == getattr(first, name),
-                    name,
-                    expected=f"the same in every set, {getattr(first, name)}",
-                    got=getattr(other, name),
-                    remedy="resample or rename before joining",
-                )
+            agree("sets", other, first, "the same in every set", remedy=joining)
         longest = max(each.steps for each in sets)
         sets = [each.padded(longest) for each in sets]
         joined: dict[str, Any] = {

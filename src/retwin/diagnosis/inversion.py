@@ -296,16 +296,15 @@ class InversionDiagnoser:
         folder = Path(folder)
         surrogate = load_surrogate(folder / "surrogate")
         faults = {
-            name: None if config is None else from_config(config, FAULTS, rate=surrogate.rate)
+            name: None if config is None else from_config(config, FAULTS)
             for name, config in about["faults"]
         }
         return cls(
             surrogate,
-            ResidualModel.load(folder / "residual", surrogate.rate),
+            ResidualModel.load(folder / "residual"),
             faults,
             noise=Noise(weights["scale"], weights["thinning"]),
-            # Development versions before 0.1.0 did not write it.
-            surrogate_variance=weights.get("surrogate_variance"),
+            surrogate_variance=weights["surrogate_variance"],
             bound=float(weights.get("bound", -np.inf)),
             calibration=from_config(about["calibration"], (Calibration,))
             if "calibration" in about

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import instance, require
+from retwin.checks import instance, nothing, require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import Diagnoser
 from retwin.scores.classification import Scores, score
@@ -42,13 +42,8 @@ def evaluate(diagnoser: Diagnoser, test: Trajectories) -> Scores:
 def scored(test: Trajectories, probabilities: NDArray, classes: Sequence[str]) -> Scores:
     """Scores of probabilities (n, classes) of labelled trajectories; see `evaluate`."""
     unknown = set(test.labels.tolist()) - set(classes)
-    require(
-        not unknown,
-        "test",
-        expected=f"labels among {', '.join(classes)}",
-        got=sorted(unknown),
-        remedy="label every trajectory with a class the diagnoser was trained on",
-    )
+    remedy = "label every trajectory with a class the diagnoser was trained on"
+    nothing("test", sorted(unknown), f"labels among {', '.join(classes)}", remedy=remedy)
     truth = np.array([list(classes).index(label) for label in test.labels])
     return score(truth, probabilities, classes)
 

@@ -25,6 +25,8 @@ from retwin.twins.system_faults import (
 )
 from retwin.update.dynamics.twin import DynamicsTwin
 
+UNEXPLAINED = 0.5
+"""Probability from which on it is told that a cause does not explain all."""
 BEFORE = 100
 """Samples before an alarm from which its cause is inferred."""
 MIN_WINDOW = 10
@@ -69,6 +71,12 @@ class Cause:
 def cause_title(name: str) -> str:
     """A cause as it is shown: an alarm that the healthy class explains best has no known cause."""
     return "no known fault" if name == HEALTHY else name
+
+
+def cause_text(name: str, since: str, unknown: float) -> str:
+    """A cause with its onset, "" where that is not known, and whether there is more to it."""
+    more = ", and more than that" if since and unknown > UNEXPLAINED else ""
+    return f"{cause_title(name)}{f' from {since}' if since else ''}{more}"
 
 
 def cause_data(

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import given, require
+from retwin.checks import agree, given, require
 from retwin.monitor.cause import BEFORE
 from retwin.monitor.decision import MIN_SAMPLES, Decision, FalseAlarmTest, decide, padded
 from retwin.monitor.gridded import gridded
@@ -66,14 +66,8 @@ def compare(store: Store, twin: str, number: int) -> Decision:
         got=f"one of {KINDS[type(new)]}",
         remedy="reject it, and watch its machine under the name of a new twin",
     )
-    require(
-        (old.twin.inputs, old.twin.outputs, old.twin.rate)
-        == (new.twin.inputs, new.twin.outputs, new.twin.rate),
-        f"version {number}",
-        expected=f"the channels and the rate of version {active.number}",
-        got="others",
-        remedy="fit it to records of the same machine",
-    )
+    whose, remedy = f"that of version {active.number}", "fit it to records of the same machine"
+    agree(f"version {number}", new.twin, old.twin, whose, remedy=remedy)
     first = registry.reference
     others = [first.number] if first and first.number not in (active.number, number) else []
     watching = [old, new, *(load_monitor(registry.folder(each)) for each in others)]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra, require
+from retwin.checks import needs_extra, nothing, require
 from retwin.errors import InputError, brief
 from retwin.monitor.audit import Entry
 
@@ -268,13 +268,8 @@ class Database:
 
     def _require_durable(self, found: dict, needed: dict, remedy: str) -> None:
         wrong = [f"{name}={found[name]}" for name, value in needed.items() if found[name] != value]
-        require(
-            not wrong,
-            self.name,
-            expected=", ".join(f"{name}={value}" for name, value in needed.items()),
-            got=", ".join(wrong),
-            remedy=remedy,
-        )
+        expected = ", ".join(f"{name}={value}" for name, value in needed.items())
+        nothing(self.name, wrong, expected, remedy=remedy)
 
 
 def present(connection: Any, key: int, times: NDArray) -> NDArray:

@@ -326,8 +326,7 @@ class Monitor:
             numbers: dict[str, Any] = {
                 name: finite(name, about[name], least=0.0) for name in NUMBERS
             }
-            given = about.get("predictors") or [[1.0, about["warm_up"]]]  # one, before version 0.2
-            predictors = tuple(Predictor(*each) for each in given)
+            predictors = tuple(Predictor(*each) for each in about["predictors"])
             streams = len(predictors) * len(twin.outputs)
             parts = (disturbance.mean, scores.independent, slack, arrays["resolution"])
             shapes = [len(each) for each in parts]

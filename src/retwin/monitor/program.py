@@ -17,7 +17,7 @@ from retwin.checks import require
 from retwin.data.logs.mapping import read_mapping
 from retwin.errors import InputError
 from retwin.monitor.audit import Entry
-from retwin.monitor.cause import cause_title
+from retwin.monitor.cause import cause_text, cause_title
 from retwin.monitor.explanations import Explanations
 from retwin.monitor.gate import Gate
 from retwin.monitor.kinds import AnyMonitor, load_monitor
@@ -48,9 +48,6 @@ from retwin.twins.faults import Fault
 
 INTERVAL = 0.5
 """Seconds after which new entries of the log are reported."""
-
-UNEXPLAINED = 0.5
-"""Probability from which on it is reported that a cause does not explain all."""
 
 
 def run(settings: MonitorSettings, report: Callable[[str], None], stop: threading.Event) -> None:
@@ -129,9 +126,8 @@ def described(entry: Entry) -> str:
         return f"twin {data['twin']}: {data['step']} version {data['version']}{reason}"
     if entry.kind == "cause":
         onset = data["onset"][0]
-        since = "" if onset is None else f" from {_moment(onset)}"
-        more = ", and more than that" if data["unknown"] > UNEXPLAINED else ""
-        text = f"cause of alarm {data['alarm']}: {cause_title(data['name'])}{since}{more}"
+        found = cause_text(data["name"], "" if onset is None else _moment(onset), data["unknown"])
+        text = f"cause of alarm {data['alarm']}: {found}"
         return f"{data['asset']}: {text} (probability {data['probability']:.2f})"
     texts = {
         "alarm": "ALARM {sequence}: {output}, {change}",

@@ -220,7 +220,7 @@ class StreamMachine(Machine[Monitor]):
 
     def restore(self, arrays: Mapping[str, NDArray]) -> bool:
         """Continue where `arrays` was stored; False if another version or monitor watched."""
-        if "stream" not in arrays:  # of a monitor of trajectories
+        if not {"stream", "status"} <= arrays.keys():  # of a monitor of trajectories, or older
             return False
         origin, done, self.newest, version, *window = arrays["stream"].tolist()
         other = not np.array_equal(arrays.get("digest", self.layout.digest), self.layout.digest)
@@ -230,9 +230,8 @@ class StreamMachine(Machine[Monitor]):
         self._origin, self._done, self._farthest, self._window = origin, done, done, window
         self._state, self._begins = arrays["monitor"], False
         self.void = bool(self.layout.state(self._state[None]).void[0])
-        if "status" in arrays:  # not in states of earlier versions of this program
-            self.evidence, *wrong = arrays["status"].tolist()
-            self._wrong = [int(each) for each in wrong]
+        self.evidence, *wrong = arrays["status"].tolist()
+        self._wrong = [int(each) for each in wrong]
         return True
 
     def _place(self, moment: int) -> int:

@@ -284,8 +284,7 @@ class TrajectoryMonitor:
             arrays = {name: each.numpy() for name, each in weights.items()}
             scores = ConformalScores.of_arrays(arrays, about["copies"])
             twin = twin_of(diagnoser)
-            # Development versions before 0.1.0 wrote neither: all trajectories are comparable.
-            measured = arrays.get("measured", ANY * np.ones(len(twin.outputs)))
+            measured = arrays["measured"]
             require(
                 len(scores.independent) == 1 and measured.shape == (2, len(twin.outputs)),
                 "weights",
@@ -303,12 +302,10 @@ class TrajectoryMonitor:
                 measured,
                 OffsetModel.of_arrays(arrays, len(twin.inputs)),
                 finite("alpha", about["alpha"], least=1e-12, most=0.5),
-                whole("used", about.get("used", 0), least=0),
-                whole("given", about.get("given", 0), least=0),
+                whole("used", about["used"], least=0),
+                whole("given", about["given"], least=0),
             )
 
 
 NUMBERS = ("kappa", "arl", "duration", "alpha", "used", "given")
 """Attributes that are saved as numbers."""
-ANY = np.array([[0.0], [np.inf]])
-"""Limits of the number of measured values that contain any."""

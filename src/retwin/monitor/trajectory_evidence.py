@@ -19,7 +19,7 @@ from retwin.diagnosis.estimate import ImplausibleError
 from retwin.diagnosis.inversion import InversionDiagnoser
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.twins.twin import check_channels
 
 Inversion = InversionDiagnoser | StateInversionDiagnoser
@@ -142,11 +142,8 @@ def _diagnosed(
     Trajectories are diagnosed one by one: the last digits of a batch depend on what else is in it,
     and a monitor that is continued later has to find the same bytes.
     """
-    found = []
-    for i in range(len(trajectories)):
-        found.append(_one(diagnoser, trajectories[[i]]))
-        if progress is not None:
-            progress((i + 1) / len(trajectories))
+    each_of = tracked(range(len(trajectories)), len(trajectories), progress)
+    found = [_one(diagnoser, trajectories[[i]]) for i in each_of]
     evidence, outside = (np.concatenate([each[k] for each in found]) for k in range(2))
     most = max(each[2].shape[1] for each in found)  # alone, each has the segments that it has
     offset = np.full((len(found), most, len(trajectories.inputs)), np.nan)

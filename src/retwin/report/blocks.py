@@ -54,9 +54,15 @@ class Column:
     paper: bool = False
 
 
-def columns(text: str, *numbers: str) -> list[Column]:
-    """A column of text, and columns of numbers."""
-    return [Column(text, numeric=False), *map(Column, numbers)]
+def columns(text: str, *others: str, texts: Sequence[str] = ()) -> list[Column]:
+    """A column of text, and others of numbers, but for those of `texts`."""
+    rest = [Column(name, numeric=name not in texts) for name in others]
+    return [Column(text, numeric=False), *rest]
+
+
+def grouped(group: str, *names: str) -> list[Column]:
+    """Columns of numbers under a common heading."""
+    return [Column(name, group=group) for name in names]
 
 
 @dataclass(frozen=True)

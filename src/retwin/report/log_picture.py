@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from retwin.arrays import runs
 from retwin.data.logs.mapped import Parts
 from retwin.data.logs.signals import Log
 from retwin.report.png import blank, dress
@@ -91,17 +92,10 @@ def _row(axes: Axes, parts: Parts, column: int, colour: str) -> None:
         axes.axvspan(grid[0], grid[-1], color=colour, alpha=0.07, linewidth=0)
         ends += [grid[0], grid[-1]]
         axes.plot(*_thinned(grid, block[:, column]), color=colour, linewidth=1.1)
-        for first, last in _holes(block[:, column]):
+        for first, last in runs(~np.isfinite(block[:, column])) - [0, 1]:
             axes.axvspan(grid[first], grid[last], 0, 0.06, color=hexadecimal("stop"), linewidth=0.8)
     for each in ends[:400]:
         axes.axvline(each, color=colour, linewidth=0.6, alpha=0.5)
-
-
-def _holes(values: NDArray) -> list[tuple[int, int]]:
-    """First and last sample of each run of missing ones."""
-    missing = np.concatenate([[False], ~np.isfinite(values), [False]]).astype(int)
-    edges = np.flatnonzero(np.diff(missing)).reshape(-1, 2)
-    return [(int(a), int(b) - 1) for a, b in edges]
 
 
 def _thinned(times: NDArray, values: NDArray) -> tuple[NDArray, NDArray]:

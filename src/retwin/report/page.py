@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from markupsafe import Markup
@@ -53,25 +53,15 @@ PAGES = "https://retwin.readthedocs.io/en/latest/"
 """The documentation."""
 DOCS = f"{PAGES}report.html"
 """The documentation of the page, to which each section links."""
-FILTERS = {
-    "class_name": labels.class_name,
-    "counted": labels.counted,
-    "duration": labels.duration,
-    "in_sentence": labels.in_sentence,
-    "mean_and_deviation": labels.mean_and_deviation,
+NAMED: tuple[Callable[..., str], ...] = (labels.class_name, labels.counted, labels.duration)
+NAMED += (labels.in_sentence, labels.mean_and_deviation, labels.number, labels.percent)
+NAMED += (labels.percents, labels.reason, labels.sentence, labels.signed, labels.span)
+NAMED += (labels.source_in_sentence, labels.source_name, labels.times)
+"""Filters of templates under their own names."""
+FILTERS = {each.__name__: each for each in NAMED} | {
     "metric": labels.metric_name,
-    "number": labels.number,
-    "percent": labels.percent,
-    "percents": labels.percents,
-    "places": lambda values: labels.places(*values),
-    "sentence": labels.sentence,
-    "signed": labels.signed,
-    "source_in_sentence": labels.source_in_sentence,
-    "source_name": labels.source_name,
-    "span": labels.span,
-    "times": labels.times,
     "outcome": outcome_of,
-    "reason": labels.reason,
+    "places": lambda values: labels.places(*values),
 }
 """What templates apply to values; see `retwin.report.labels`."""
 

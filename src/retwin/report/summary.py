@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.report.blocks import Cell, Column, Table
+from retwin.report.blocks import Cell, Table, columns
 from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row, draw_bands
 from retwin.report.labels import (
     in_sentence,
@@ -99,16 +99,13 @@ def learned(study: Study) -> Table | None:
         # Of a component that both have, the one that more segments identify.
         if name not in rows or row.count > rows[name].count:
             rows[name] = row
-    columns = [
-        Column("Quantity", numeric=False),
-        Column("Mean"),
-        Column("95 % interval"),
-        Column("Range of 90 % of the segments"),
-        Column("Generated mean"),
-        Column("Segments"),
-    ]
+    names = "Mean", "95 % interval", "Range of 90 % of the segments", "Generated mean", "Segments"
     cells = [row.cells for row in rows.values()]
-    return Table("What was learned", columns, cells).without_empty() if rows else None
+    return (
+        Table("What was learned", columns("Quantity", *names), cells).without_empty()
+        if rows
+        else None
+    )
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,10 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache, partial
-from operator import truediv
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -24,7 +23,6 @@ from pydantic import (
     ConfigDict,
     PlainValidator,
     ValidationError,
-    ValidationInfo,
     create_model,
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
@@ -36,52 +34,6 @@ from retwin.serialisation.files import check_regular
 T = TypeVar("T")
 MAX_DEPTH = 100
 """The largest number of dots in a key; reading takes memory by the square of it."""
-
-
-@dataclass(frozen=True)
-class Converted:
-    """A setting that was in samples before version 0.1.0, and is in seconds or in Hz now.
-
-    One that has kept its name was a whole number, and has always been written as a decimal since.
-
-    Parameters
-    ----------
-    name : str
-        Its present name.
-    convert : callable
-        From a number of samples and the sample rate in Hz to the present value; by default to
-        seconds.
-
-    """
-
-    name: str
-    convert: Callable[[float, float], float] = truediv
-
-    def of(self, value: Any, rate: float) -> Any:
-        """The numbers of `value` converted; what is no number stays, to be refused."""
-        if isinstance(value, list | tuple):
-            return [self.of(each, rate) for each in value]
-        return self.convert(value, rate) if type(value) in (int, float) else value
-
-
-RENAMED_KINDS = {"SteadyStateError": "ActuatorBias"}
-"""Kinds in files of versions before 0.1.0, and their present names."""
-RENAMED_SETTINGS: dict[str, dict[str, str | Converted]] = {
-    "RampSampler": {
-        "movements": "segments",
-        "steps": Converted("duration"),
-        "ramps": Converted("ramp_durations"),
-    },
-    "HoldSampler": {"steps": Converted("duration"), "hold": Converted("hold_durations")},
-    "MultisineSampler": {"steps": Converted("duration")},
-    "RecordedSampler": {"length": Converted("duration")},
-    "Stuck": {"onset": Converted("onset")},
-    "Training": {"epochs": "max_epochs", "batch": "batch_size", "rate": "learning_rate"},
-    "CommandSpace": {"most": "max_samples", "known": "identified_below"},
-    "SampledSensor": {"every": Converted("period"), "glitch_rate": "glitch_probability"},
-    "SequenceMixture": {"gap": "margin"},
-}
-"""Per kind, settings in files of versions before 0.1.0, and their present names."""
 
 
 def read_toml(path: Path, *, expected: str, remedy: str) -> dict[str, Any]:
@@ -139,7 +91,6 @@ def from_config(
     kinds: Sequence[type],
     *,
     place: str = "config",
-    rate: float | None = None,
 ) -> Any:
     """The object that `to_config` described.
 
@@ -151,15 +102,12 @@ def from_config(
         The dataclasses that may be made.
     place : str
         What messages name before the key, such as "case.toml:".
-    rate : float, optional
-        Sample rate in Hz, by which settings of former versions are converted from samples.
 
     Raises
     ------
     InputError
-        The kind is unknown, a parameter is unknown, missing or of another type, the class refuses
-        its parameters, or one is in samples and there is no rate. The message names `place` and
-        the key.
+        The kind is unknown, a parameter is unknown, missing or of another type, or the class
+        refuses its parameters. The message names `place` and the key.
 
     """
     known = {kind.__name__: kind for kind in kinds}
@@ -167,12 +115,12 @@ def from_config(
     version = "; a model loads with the version of retwin that wrote it"
     name = one_of(
         key(place, "kind"),
-        RENAMED_KINDS.get(name, name) if isinstance(name, str) else name,
+        name,
         known,
         remedy=f"check the spelling{version if place == 'config' else ''}",
     )
     settings = {each: value for each, value in values.items() if each != "kind"}
-    return from_settings(known[name], settings, kinds, place=place, rate=rate)
+    return from_settings(known[name], settings, kinds, place=place)
 
 
 def from_settings(
@@ -181,7 +129,6 @@ def from_settings(
     kinds: Sequence[type] = (),
     *,
     place: str,
-    rate: float | None = None,
 ) -> T:
     """An object of the dataclass `kind` from its parameters by name.
 
@@ -189,7 +136,7 @@ def from_settings(
     parameter names. Raises as `from_config` does.
     """
     model = _model(kind, tuple(kinds))  # type: ignore[arg-type]
-    made = _validated(model, settings, place, rate)
+    made = _validated(model, settings, place)
     with at(place):
         return kind(**made)
 
@@ -200,14 +147,13 @@ def checked(
     *,
     place: str,
     besides: Sequence[str],
-    rate: float | None = None,
 ) -> dict[str, Any]:
     """Some parameters of the dataclass `kind`, lists as tuples, each of the type it should have.
 
     Raises InputError for unknown parameters, for those named in `besides`, and for values of
     another type. The message names `place` and the key.
     """
-    return _validated(_model(kind, (), tuple(besides)), settings, place, rate)
+    return _validated(_model(kind, (), tuple(besides)), settings, place)
 
 
 def key(place: str, name: str) -> str:
@@ -239,9 +185,7 @@ def _is_protocol(hint: Any) -> bool:
     return getattr(hint, "_is_protocol", False)
 
 
-def _validated(
-    model: type[BaseModel], settings: Any, place: str, rate: float | None
-) -> dict[str, Any]:
+def _validated(model: type[BaseModel], settings: Any, place: str) -> dict[str, Any]:
     """The parameters of `model` that `settings` hold; InputError about the first bad key."""
     require(
         isinstance(settings, Mapping),
@@ -250,17 +194,16 @@ def _validated(
         got=repr(settings),
         remedy="write { key = value, … }",
     )
-    given = _present(model.__name__, settings, place, rate)
-    for name in given:
+    for name in settings:
         one_of(key(place, name), name, model.model_fields, remedy="check the spelling")
     try:
-        made = model.model_validate(_tuples(given), context=rate)
+        made = model.model_validate(_tuples(settings))
         return {name: getattr(made, name) for name in made.model_fields_set}
     except ValidationError as error:
         errors = error.errors(include_url=False)
     name = str(errors[0]["loc"][0])
     where = key(place, name)
-    require(name in given, where, expected="a value", got="none", remedy="give it: it is needed")
+    require(name in settings, where, expected="a value", got="none", remedy="give it: it is needed")
     errors = [each for each in errors if each["loc"][0] == name]
     for each in errors:
         if "error" in each.get("ctx", {}):  # an InputError from inside a config object
@@ -269,38 +212,9 @@ def _validated(
     raise InputError(
         where,
         expected=" or ".join(dict.fromkeys(map(plain_reason, errors))),
-        got=repr(given[name]),
+        got=repr(settings[name]),
         remedy="see what this key may hold",
     )
-
-
-def _present(
-    kind: str, settings: Mapping[str, Any], place: str, rate: float | None
-) -> dict[str, Any]:
-    """The settings under their present names, and in seconds or Hz where they were in samples."""
-    given = {}
-    for former, value in settings.items():
-        present = RENAMED_SETTINGS.get(kind, {}).get(former, former)
-        if isinstance(present, str):
-            given[present] = value
-            continue
-        same = present.name == former
-        require(
-            same or rate is not None,
-            key(place, former),
-            expected=f"{present.name}, in seconds or Hz",
-            got=f"{value!r} in samples, as before version 0.1.0",
-            remedy="convert it by the sample rate",
-        )
-        if rate is not None and (not same or _whole(value)):
-            value = present.of(value, rate)
-        given[present.name] = value
-    return given
-
-
-def _whole(value: Any) -> bool:
-    """Whether a value holds whole numbers only."""
-    return all(map(_whole, value)) if isinstance(value, list | tuple) else type(value) is int
 
 
 def plain_reason(error: ErrorDetails) -> str:
@@ -348,18 +262,16 @@ def _classes(configs: tuple[Any, ...]) -> tuple[type, ...]:
     return tuple(each for each in configs if not _is_protocol(each))
 
 
-def _config(
-    hints: tuple[Any, ...], kinds: tuple[type, ...], value: Any, info: ValidationInfo
-) -> Any:
+def _config(hints: tuple[Any, ...], kinds: tuple[type, ...], value: Any) -> Any:
     """The config object of one of `hints` that a table describes; messages begin with its keys."""
     if isinstance(value, Mapping):
         classes = _classes(hints)
         if "kind" not in value and len(hints) == len(classes) == 1:
-            return from_settings(classes[0], value, kinds, place="", rate=info.context)
+            return from_settings(classes[0], value, kinds, place="")
         fitting = [kind for kind in kinds if any(fits(kind, hint) for hint in hints)]
         known = value.get("kind") in [kind.__name__ for kind in kinds]
         allowed = (*classes, *(kinds if known else fitting))
-        made = from_config(value, allowed, place="", rate=info.context)
+        made = from_config(value, allowed, place="")
         if any(fits(made, hint) for hint in hints):
             return made
     names = " or ".join(hint.__name__ for hint in hints)

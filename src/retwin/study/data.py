@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from retwin.cases.case import Case
-from retwin.checks import require
+from retwin.checks import nothing, require
 from retwin.data.io import load
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
@@ -168,11 +168,7 @@ def _labelled(trajectories: Trajectories, case: Case, name: str) -> Trajectories
     if not case.diagnosed:
         return trajectories.replace(labels=np.full(len(trajectories), case.classes[0]))
     unknown = set(trajectories.labels.tolist()) - set(case.classes)
-    require(
-        not unknown,
-        name,
-        expected=f"trajectories labelled with the classes {', '.join(case.classes)}",
-        got=sorted(unknown),
-        remedy="label every trajectory: labels are needed to score a study",
-    )
+    expected = f"trajectories labelled with the classes {', '.join(case.classes)}"
+    remedy = "label every trajectory: labels are needed to score a study"
+    nothing(name, sorted(unknown), expected, remedy=remedy)
     return trajectories

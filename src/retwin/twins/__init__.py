@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from retwin._lazy import homes, names
 from retwin.catalog import TWINS, resolve
-from retwin.checks import require
+from retwin.checks import nothing, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 
@@ -123,13 +123,8 @@ def get(
 
 def _check_none(name: str, options: Mapping[str, Any]) -> None:
     """Refuse options that this kind of twin does not have."""
-    require(
-        not options,
-        f"twin {name!r}",
-        expected="no such options, which are those of another kind of twin",
-        got=", ".join(options),
-        remedy="leave them out",
-    )
+    expected = "no such options, which are those of another kind of twin"
+    nothing(f"twin {name!r}", options, expected, remedy="leave them out")
 
 
 def _from_module(

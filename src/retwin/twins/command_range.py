@@ -102,13 +102,6 @@ class CommandRange:
         )
 
     @classmethod
-    def around(cls, mean: NDArray, deviation: NDArray, *, deviations: float) -> CommandRange:
-        """The values within so many standard deviations (d_u,), without a limit of the speed."""
-        free = (inf,) * len(mean)
-        low, high = mean - deviations * deviation, mean + deviations * deviation
-        return cls(floats(low), floats(high), free, free, free, free, 0.0, 0)
-
-    @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> CommandRange:
         """The range from the values of `dataclasses.asdict`, with JSON lists."""
         parts = {name: floats(np.atleast_1d(values[name])) for name in ARRAYS}

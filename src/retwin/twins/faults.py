@@ -155,7 +155,6 @@ class Stuck:
 
     def __post_init__(self) -> None:
         low, high = checked_onset(self.onset)
-        # Decimals: in files a whole number is an onset in samples, as before version 0.1.0.
         onset = (low, high) if isinstance(self.onset, Sequence) else low
         object.__setattr__(self, "onset", onset)
 

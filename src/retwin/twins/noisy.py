@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from retwin.arrays import interpolated
 from retwin.checks import require
-from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.times import stride_of
 from retwin.twins.faults import Fault
-from retwin.twins.twin import Chunk, Twin, simulate_in_chunks
+from retwin.twins.twin import Chunk, Twin, check_healthy, simulate_in_chunks
 from retwin.twins.wrapper import TwinWrapper, chunk_generator, simulate_chunk
 
 OUTPUT_NOISE = 4
@@ -108,14 +108,7 @@ def residual_scale(calibration: Trajectories) -> NDArray:
         No trajectory, a trajectory with a fault, or an output that was never measured.
 
     """
-    healthy = np.isin(calibration.labels, (HEALTHY, UNLABELLED))
-    require(
-        len(calibration) > 0 and bool(healthy.all()),
-        "calibration",
-        expected="healthy trajectories, one at least",
-        got=f"{len(calibration)}, {int((~healthy).sum())} of them with a fault",
-        remedy=f"take calibration.with_label({HEALTHY!r})",
-    )
+    check_healthy("calibration", calibration)
     require(
         calibration.mask.any(axis=(0, 1)).all(),
         "calibration",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import at_least, finite, one_of, require, whole
+from retwin.checks import at_least, finite, nothing, one_of, require, whole
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.times import sample_rate
@@ -315,12 +315,8 @@ class StateTwin:
 
         defaults = dict(zip(self.names, self.values(None, 1)[0], strict=True))
         unknown = sorted(set(parameters or {}) - set(defaults))
-        require(
-            not unknown,
-            "parameters",
-            expected=f"some of {', '.join(self.names)}",
-            got=", ".join(unknown),
-            remedy="check the spelling",
+        nothing(
+            "parameters", unknown, f"some of {', '.join(self.names)}", remedy="check the spelling"
         )
         like = commands.new_zeros(len(commands), dtype=torch.float64)
         given = (defaults | dict(parameters or {})).values()

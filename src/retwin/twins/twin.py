@@ -14,7 +14,7 @@ from retwin.arrays import check_finite
 from retwin.checks import agree, instance, require, whole
 from retwin.data.measured import check_magnitude
 from retwin.data.segments import Segments
-from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Trajectories
+from retwin.data.trajectories import HEALTHY, Channels, Trajectories
 from retwin.progress import Progress
 from retwin.threads import Turns, in_threads
 from retwin.times import stride_of
@@ -149,18 +149,23 @@ def checked_stride(
 
     """
     instance(argument, trajectories, Trajectories, remedy="load recorded ones, or simulate a twin")
-    healthy = np.isin(trajectories.labels, (HEALTHY, UNLABELLED))
-    require(
-        len(trajectories) > 0 and healthy.all(),
-        argument,
-        expected="healthy trajectories, one at least",
-        got=f"{len(trajectories)}, {int((~healthy).sum())} of them with a fault",
-        remedy=f"take {argument}.with_label({HEALTHY!r})",
-    )
+    check_healthy(argument, trajectories)
     check_channels(twin, trajectories, argument)
     check_magnitude(argument, trajectories)
     return stride_of(
         trajectories.rate, rate, steps=trajectories.steps, remedy="give the sensor's true rate"
+    )
+
+
+def check_healthy(argument: str, trajectories: Trajectories) -> None:
+    """Refuse a set without trajectories, or with one that is labelled with a fault."""
+    faulty = int((~trajectories.maybe_healthy).sum())
+    require(
+        len(trajectories) > 0 and not faulty,
+        argument,
+        expected="healthy trajectories, one at least",
+        got=f"{len(trajectories)}, {faulty} of them with a fault",
+        remedy=f"take {argument}.with_label({HEALTHY!r})",
     )
 
 

@@ -160,7 +160,7 @@ class CorrectedTwin:
         about = read_about(folder, "corrected")
         folder = Path(folder)
         surrogate = load_surrogate(folder / "surrogate")
-        residual = load_residual(folder / "residual", surrogate.rate)
+        residual = load_residual(folder / "residual")
         with refusing(folder, expected="a corrected twin"):
             forecast = ForecastErrors.of(about.get("forecast"))
             return cls(surrogate, residual, about["case"], about["random"], forecast)

@@ -45,9 +45,6 @@ MAX_SAMPLES = 200_000
 the error."""
 MAX_SEQUENCE_SAMPLES = 10_000_000
 """Largest number of samples, in whole trajectories, that a network with memory is trained on."""
-WITHIN = 4.0
-"""Standard deviations of the training commands within which commands are taken to lie, of a model
-that was saved without their range."""
 TRAINING = {
     "MLP": Training(max_epochs=20, batch_size=256, learning_rate=5e-3),
     "LSTM": Training(max_epochs=10, batch_size=32, learning_rate=5e-3),
@@ -204,14 +201,9 @@ class Surrogate(nn.Module):
             )
             surrogate.load_state_dict(weights)
             surrogate.fitted = Fit.of(about["fitted"])
-            # Files from before version 0.1.0 hold the mean and the deviation of the commands alone.
-            if about.get("trained") is not None:
+            if about["trained"] is not None:
                 surrogate.trained = CommandRange.from_json(about["trained"])
                 one_per("trained", surrogate.trained.low, len(surrogate.inputs), "command")
-            elif surrogate.fitted is not None:
-                before = surrogate.before
-                moments = before.mean.numpy(), before.scale.numpy()
-                surrogate.trained = CommandRange.around(*moments, deviations=WITHIN)
         return surrogate.eval()
 
 

@@ -222,8 +222,8 @@ def test_a_bundle_generates_without_its_case_where_it_can(bundle: Bundle) -> Non
         sampler=RampSampler((400.0,) * 4, (600.0,) * 4, 100.0, 2.0, 2, (0.6, 0.8, 1.0)),
     )
     about = json.loads(json.dumps(facts.about()))
-    assert Facts.of(about, 100.0) == facts
-    alone = Bundle(bundle.twin, bundle.guard, Facts.of(about, 100.0))
+    assert Facts.of(about) == facts
+    alone = Bundle(bundle.twin, bundle.guard, Facts.of(about))
     assert len(alone.generate(per_class=1, seed=0)) == 9
     with pytest.raises(rt.InputError, match="one with a diagnoser"):
         alone.predict(rt.generate(bundle.twin, alone.case, per_class=1, seed=0))

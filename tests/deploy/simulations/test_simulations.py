@@ -26,6 +26,7 @@ import retwin as rt
 from retwin import twins
 from retwin.data.io.zarr_folder import read_header, read_zarr
 from retwin.deploy.simulations import Simulated, SimulationPlan, simulate_to
+from retwin.deploy.simulations.job import _check_same
 from retwin.jobs import alone
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256
@@ -480,6 +481,11 @@ def test_another_plan_is_refused(tmp_path: Path, match: str, changes: dict[str, 
             simulate_to(tmp_path / name, plan(**changes), workers=1)
     simulate_to(tmp_path / "a.zarr", plan(twin=Toy(workers=7)), workers=1)
     assert sha256(tmp_path / "a.zarr") == sha256(tmp_path / "b.zarr")
+
+
+def test_a_plan_of_another_version_is_not_resumed() -> None:
+    with pytest.raises(rt.InputError, match="one begun by another version of retwin"):
+        _check_same(Path("a.zarr"), {"retwin": "0.0.9"}, {"retwin": "0.1.0"})
 
 
 @pytest.mark.parametrize(

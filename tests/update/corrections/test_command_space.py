@@ -380,8 +380,3 @@ def test_names_units_and_config() -> None:
     ]
     assert from_config(to_config(operator, KINDS), KINDS) == operator
     assert isinstance(operator, rt.Correction)
-
-
-def test_settings_of_earlier_versions_load() -> None:
-    before = {"kind": "CommandSpace", "delay_range": [0.0, 4.0], "most": 50, "known": 0.5}
-    assert from_config(before, KINDS) == rt.CommandSpace((0.0, 4.0), 50, 0.5)

@@ -123,11 +123,12 @@ def test_it_is_the_same_online(twin: DynamicsTwin) -> None:
     np.testing.assert_allclose(whole[:, 100:], wanted[:, 100:], rtol=1e-3)
 
 
-def test_models_that_were_saved_without_it_have_none(twin: DynamicsTwin, tmp_path: Path) -> None:
+def test_it_is_saved_and_a_model_without_it_is_refused(twin: DynamicsTwin, tmp_path: Path) -> None:
     twin.save(tmp_path / "model")
     assert DynamicsTwin.load(tmp_path / "model").proportional == twin.proportional
     file = tmp_path / "model" / "weights.safetensors"
     weights = load_file(file)
     del weights["proportional"]
     save_file(weights, file)
-    assert DynamicsTwin.load(tmp_path / "model").proportional == pytest.approx([0.0])
+    with pytest.raises(rt.InputError, match="proportional"):
+        DynamicsTwin.load(tmp_path / "model")

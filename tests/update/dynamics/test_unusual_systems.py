@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from safetensors.torch import load_file, save_file
@@ -266,28 +264,6 @@ def test_forged_weights_are_refused(fitted: DynamicsTwin, tmp_path, name: str, v
     save_file(weights, file)
     with pytest.raises(rt.InputError):
         DynamicsTwin.load(tmp_path / "model")
-
-
-@pytest.mark.parametrize("widening", [float("nan"), -1.0, "1"])
-def test_a_forged_factor_of_all_outputs_is_refused(
-    fitted: DynamicsTwin, tmp_path, widening
-) -> None:
-    fitted.save(tmp_path / "model")
-    file = tmp_path / "model" / "model.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "widening": widening}))
-    with pytest.raises(rt.InputError):
-        DynamicsTwin.load(tmp_path / "model")
-
-
-def test_a_model_with_one_factor_of_all_outputs_is_read(fitted: DynamicsTwin, tmp_path) -> None:
-    fitted.save(tmp_path / "model")
-    about, weights = tmp_path / "model" / "model.json", tmp_path / "model" / "weights.safetensors"
-    kept = load_file(weights)
-    factor = kept.pop("widening")
-    save_file(kept, weights)
-    about.write_text(json.dumps({**json.loads(about.read_text()), "widening": factor.item()}))
-    found = DynamicsTwin.load(tmp_path / "model")
-    np.testing.assert_array_equal(found.widening, fitted.widening)
 
 
 def test_bands_are_scaled_for_each_output() -> None:

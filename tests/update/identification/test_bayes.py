@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 import warnings
@@ -17,8 +16,6 @@ from toys import FAST, LAG, LINE, commands, measured
 
 import retwin as rt
 from retwin.testing import TWIN_CHECKS, TwinSubject
-from retwin.twins.command_side import CommandSide, command_side_parameters
-from retwin.twins.parametric import ParametricTwin
 from retwin.update.identification import (
     MCMC,
     NPE,
@@ -247,31 +244,6 @@ def test_a_saved_posterior_draws_the_same(
         PosteriorTwin.load(tmp_path / "white", FAST)
     with pytest.raises(rt.InputError, match="posterior model"):
         PosteriorTwin.load(tmp_path, LAG)
-
-
-def test_former_delays_in_samples_are_converted(tmp_path: Path) -> None:
-    drive = rt.FunctionTwin(
-        np.copy, rt.Channels(("u",), ("V",)), rt.Channels(("y",), ("m",)), rate=50.0
-    )
-    free = command_side_parameters(drive.inputs, delay=(0.0, 0.2), offset=1.0)
-    twin = ParametricTwin(CommandSide(drive), free).with_values([0.06, 0.1])
-    noise = np.array([[-9.0], [-9.0]])
-    samples = np.array([[0.04, 0.0], [0.08, 0.2]])
-    now = PosteriorTwin(twin, WHITE, samples, noise, np.ones(1))
-    now.save(tmp_path / "now")
-    in_samples = [50.0, 1.0]
-    former = PosteriorTwin(
-        twin.with_values(np.array(twin.values) * in_samples),
-        *(WHITE, samples * in_samples, noise, np.ones(1)),
-    )
-    former.save(tmp_path / "former")
-    about = json.loads((tmp_path / "former" / "model.json").read_text())
-    del about["units"]
-    (tmp_path / "former" / "model.json").write_text(json.dumps(about))
-    for name in ("now", "former"):
-        found = PosteriorTwin.load(tmp_path / name, twin)
-        np.testing.assert_allclose(found.samples, samples)
-        np.testing.assert_allclose(found.twin.values, twin.values)
 
 
 def test_every_trajectory_draws_parameters_of_its_own(chains: Posterior) -> None:

@@ -371,16 +371,11 @@ def test_saved_and_loaded_is_the_same(
     np.testing.assert_array_equal(back.timing, rg.timing)
 
 
-def test_models_from_before_student_s_distribution_open(
-    rg: rt.ResidualModel, tmp_path: Path
-) -> None:
-    """Their `spread` contains the uncertainty of the width; damaged degrees are refused."""
+def test_damaged_degrees_are_refused(rg: rt.ResidualModel, tmp_path: Path) -> None:
     rg.save(tmp_path / "rg")
     file = tmp_path / "rg" / "model.json"
     about = json.loads(file.read_text())
-    degrees = about.pop("degrees")
-    file.write_text(json.dumps(about))
-    assert rt.ResidualModel.load(tmp_path / "rg").degrees == [np.inf] * len(rg.sizes)
+    degrees = about["degrees"]
     for damaged in ([0.5, *degrees[1:]], degrees[1:], ["1", *degrees[1:]]):
         file.write_text(json.dumps(about | {"degrees": damaged}))
         with pytest.raises(rt.InputError):

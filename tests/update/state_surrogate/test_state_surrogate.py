@@ -205,7 +205,7 @@ def test_a_constant_output_and_another_rate_are_refused() -> None:
     with pytest.raises(InputError, match=r"outputs that change.*position"):
         fit_state_surrogate(still, SHORT, settings=SMALL)
     slow = HoldSampler((-2.0,), (2.0,), 2 * RATE, 6.0)
-    with pytest.raises(InputError, match=r"commands.*rate of the twin"):
+    with pytest.raises(InputError, match=r"commands\.rate: expected that of the twin"):
         fit_state_surrogate(GAINS, slow, settings=SMALL)
     with pytest.raises(InputError, match="spread"):
         StateSurrogate(spread=1.5)

@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.cases.animation.captions import captioned
-from retwin.cases.animation.chart import Chart, Layout, charted
 from retwin.cases.animation.film import check_film, write_film
-from retwin.cases.animation.offscreen import mujoco_pictures
+from retwin.cases.animation.page import Chart, film_pages, picture_size
 from retwin.cases.animation.shots import Pictures, Shots
-from retwin.cases.animation.sticks import stick_pictures
-from retwin.checks import finite, one_of, require
+from retwin.cases.animation.solid import mujoco_pictures
+from retwin.checks import agree, finite, one_of, require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.serialisation.files import write_atomically
 
 if TYPE_CHECKING:  # a case loads torch, which the worker that draws does not need
@@ -103,36 +101,22 @@ def animate(
     body = _body_of(case)
     one = _chosen(trajectories, case, index)
     one = case.complete(one)
-    shots, layout, chart = _shots(one, body, fps), Layout(size, (0, 0)), None
+    shots, chart = _shots(one, body, fps), None
     if updated is not None:
         drawn = _draws(updated, one, seed)
         shots = replace(shots, drawn=_tips(body, one, drawn[:SHOWN], fps))
-        layout, chart = Layout.of(size), _chart(one, drawn)
-    target = Path(path)
-    with (
-        write_atomically(target) as part,
-        _pictures(shots, body, layout.picture, renderer) as pictures,
-    ):
-        reported = captioned(_reported(pictures, len(shots), progress), shots)
-        whole = reported if chart is None else charted(reported, shots, chart, layout)
-        write_film(whole, part, suffix, fps=fps, size=size)
+        chart = _chart(one, drawn)
+    target, inner = Path(path), picture_size(size, chart=chart is not None)
+    with write_atomically(target) as part, _pictures(shots, body, inner, renderer) as pictures:
+        pages = tracked(film_pages(shots, size, pictures, chart), len(shots), progress)
+        write_film(pages, part, suffix, fps=fps, size=size)
     return target
 
 
 def _draws(updated: Twin, one: Trajectories, seed: int) -> NDArray:
     """Outputs (draws, T, d_y) of the updated twin for the commands of a trajectory."""
-    for name, has, needs in (
-        ("inputs", updated.inputs.names, one.inputs.names),
-        ("outputs", updated.outputs.names, one.outputs.names),
-        ("rate", updated.rate, one.rate),
-    ):
-        require(
-            has == needs,
-            "updated",
-            expected=f"a twin with the {name} {needs} of the trajectory",
-            got=f"one with {has}",
-            remedy="give the corrected twin that was fitted for these data",
-        )
+    remedy = "give the corrected twin that was fitted for these data"
+    agree("updated", updated, one, "that of the trajectory", remedy=remedy)
     made = updated.simulate(np.repeat(one.commands, DRAWS, axis=0), seed=seed)
     require(
         bool(np.isfinite(made.observed).all()),
@@ -251,25 +235,17 @@ def _samples(one: Trajectories, fps: float) -> NDArray:
 
 
 @contextmanager
-def _pictures(shots: Shots, body: Body, size: tuple[int, int], renderer: str) -> Iterator[Pictures]:
-    """The pictures of the chosen renderer, or of the best one that is available."""
-    if renderer == "stick":
-        yield stick_pictures(shots, size)
-        return
+def _pictures(
+    shots: Shots, body: Body, size: tuple[int, int], renderer: str
+) -> Iterator[Pictures | None]:
+    """The pictures of MuJoCo; None for stick figures, or where it cannot draw."""
     with ExitStack() as stack:
+        found = None
         try:
-            found = stack.enter_context(mujoco_pictures(shots, body, size))
+            if renderer != "stick":
+                found = stack.enter_context(mujoco_pictures(shots, body, size))
         except InputError as error:
             if renderer == "mujoco":
                 raise
             warnings.warn(f"drawn as a stick figure: {error}", stacklevel=5)
-            found = stick_pictures(shots, size)
         yield found
-
-
-def _reported(pictures: Pictures, count: int, progress: Progress | None) -> Iterator[NDArray]:
-    """The same pictures; reports progress after each of them."""
-    for i, picture in enumerate(pictures):
-        yield picture
-        if progress is not None:
-            progress((i + 1) / count)

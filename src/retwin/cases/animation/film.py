@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import ends_in, require
 from retwin.serialisation.places import check_place
 
 TICKS = 100
@@ -37,13 +37,7 @@ def check_film(path: str | os.PathLike[str]) -> str:
 
     """
     suffix = Path(path).suffix.lower()
-    require(
-        suffix in (".mp4", ".gif"),
-        "path",
-        expected="a name that ends in .mp4 or .gif",
-        got=path,
-        remedy="choose one of these formats by the name",
-    )
+    ends_in("path", path, (".mp4", ".gif"), remedy="choose one of these formats by the name")
     require(
         suffix == ".gif" or importlib.util.find_spec("imageio_ffmpeg") is not None,
         "path",

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from retwin.catalog import FORMATS, LOGS, FormatEntry, resolve
-from retwin.checks import existing, instance, require
+from retwin.checks import ends_in, existing, instance
 from retwin.data.io.assembly import DataCase, settle
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
@@ -123,13 +123,7 @@ def check_target(path: str | os.PathLike[str]) -> str:
     """
     suffix = Path(path).suffix.lower()
     writable = [name for name, entry in FORMATS.items() if entry.writer]
-    require(
-        suffix in writable,
-        "path",
-        expected=f"a name that ends in {' or '.join(writable)}",
-        got=str(path),
-        remedy="choose one of these formats by the name",
-    )
+    ends_in("path", path, writable, remedy="choose one of these formats by the name")
     folder = FORMATS[suffix].folder
     replaced = folder and (Path(path) / "zarr.json").is_file()
     check_place(path, folder=folder, holds=None if replaced else ())

@@ -18,7 +18,7 @@ from retwin.data.io.mat import mat_variables, matrix
 from retwin.data.io.mat5 import Opaque
 from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError, brief
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.serialisation.files import sha256
 from retwin.serialisation.sizes import Budget
 
@@ -68,7 +68,7 @@ def read_class_folders(
     )
     files, read = found[0]
     raws, budget = [], Budget(path.name, max_bytes)
-    for i, file in enumerate(files):
+    for file in tracked(files, len(files), progress):
         where = f"{file.parent.name}/{file.name}"
         require(
             file.is_file(),
@@ -78,8 +78,6 @@ def read_class_folders(
             remedy="keep nothing else of that name there",
         )
         raws.append(read(file, where, case, budget))
-        if progress is not None:
-            progress((i + 1) / len(files))
     raws, inputs = _commands_of_case(raws, case, radians=read is _read_dataset)
     return assemble(
         raws,

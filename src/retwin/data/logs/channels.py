@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import require, same_names
 from retwin.data.logs.mapping import ChannelMapping
 from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Log, Signal
 from retwin.data.logs.units import converted, same_unit
@@ -106,13 +106,8 @@ def table_of(
     """
     if wanted is None:
         return [(each, own, None) for each, own in table.items()]
-    require(
-        set(table) == set(wanted.names),
-        f"mapping: {name}",
-        expected=f"the channels of the case, {', '.join(wanted.names)}",
-        got=", ".join(table) or "none",
-        remedy=f"write a table [{name}.NAME] for each of them",
-    )
+    remedy = f"write a table [{name}.NAME] for each of them"
+    same_names(f"mapping: {name}", table, wanted.names, "the channels of the case,", remedy=remedy)
     return [
         (each, table[each], unit if stated or unit != "1" else None)
         for each, unit in zip(wanted.names, wanted.units, strict=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.arrays import runs
 from retwin.checks import given, require
 from retwin.data.io.assembly import DataCase, Raw, assemble
 from retwin.data.logs.channels import Channel, channels_of, in_order, signal_of, table_of
@@ -185,13 +186,13 @@ class Parts:
         columns = [each.sampled(grid, 1 / self.rate, self.end) for each in self.every]
         block = np.stack(columns, axis=1) if count else np.empty((0, len(columns)))
         known = np.isfinite(block)
-        used = known[:, : self.needed].all(axis=1) if self.needed else known.any(axis=1)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], used, [False]]).astype(int)))
-        runs = edges.reshape(-1, 2)
-        if not self.needed and len(edges):
-            runs = edges[[0, -1]][None]  # missing outputs end no trajectory
+        needed = known[:, : self.needed]
+        used = np.all(needed, axis=1) if self.needed else np.any(known, axis=1)
+        parts = runs(used)
+        if not self.needed and len(parts):
+            parts = parts.reshape(1, -1)[:, [0, -1]]  # missing outputs end no trajectory
         kept = 0
-        for first, stop in runs:
+        for first, stop in parts:
             if stop - first < shortest:
                 self.short += 1
             elif not known[first:stop, self.needed :].any():
@@ -200,7 +201,7 @@ class Parts:
                 kept += 1
                 self.blocks.append((float(grid[first]), block[first:stop]))
         self.split += max(0, kept - 1)
-        self.short += not len(runs)
+        self.short += not len(parts)
 
     def raws(self, log: Log, label: str) -> list[Raw]:
         """The trajectories, each with its start in s as a name."""

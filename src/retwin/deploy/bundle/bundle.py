@@ -215,7 +215,7 @@ class Bundle:
             return cls(
                 twin=twin,
                 guard=Guard.of(*read_model(folder / "guard", "guard")),
-                facts=Facts.of(about, twin.rate),
+                facts=Facts.of(about),
                 diagnoser=load_diagnoser(folder / "diagnoser") if about["diagnoser"] else None,
                 provenance=dict(about["provenance"]),
             )

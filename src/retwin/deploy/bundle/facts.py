@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from retwin.checks import require, whole
+from retwin.checks import same_names, whole
 from retwin.serialisation.configs import from_config, to_config
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
@@ -64,13 +64,11 @@ class Facts:
     def check_classes(self, diagnoser: Any) -> None:
         """Raise InputError unless a diagnoser, if there is one, has these classes, each once."""
         given = self.classes if diagnoser is None else diagnoser.classes
-        require(
-            sorted(given) == sorted(self.classes),
-            "diagnoser",
-            expected=f"one of the classes of {self.case}, {', '.join(self.classes)}",
-            got=", ".join(given),
-            remedy="train it on trajectories of this case",
+        what, remedy = (
+            f"one of the classes of {self.case},",
+            "train it on trajectories of this case",
         )
+        same_names("diagnoser", given, self.classes, what, remedy=remedy)
 
     def about(self) -> dict[str, Any]:
         """The facts as JSON values; InputError for a fault that is none of `FAULTS`."""
@@ -87,20 +85,18 @@ class Facts:
         }
 
     @classmethod
-    def of(cls, about: Mapping[str, Any], rate: float) -> Facts:
-        """The facts from the JSON values of `about`, of a system with this sample rate in Hz."""
+    def of(cls, about: Mapping[str, Any]) -> Facts:
+        """The facts from the JSON values of `about`."""
         faults = {
-            name: None if fault is None else from_config(fault, FAULTS, rate=rate)
+            name: None if fault is None else from_config(fault, FAULTS)
             for name, fault in about["faults"].items()
         }
         sampler = about["sampler"]
-        if sampler is not None:  # before version 0.1.0 it had no rate of its own
-            sampler = from_config({"rate": rate, **sampler}, SAMPLERS, rate=rate)
         return cls(
             case=str(about["case"]),
             faults=faults,
             sensor_rate=about["sensor_rate"],
             steps=about["steps"],
             max_segments=about["movements"],
-            sampler=sampler,
+            sampler=None if sampler is None else from_config(sampler, SAMPLERS),
         )

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra, one_of, require
+from retwin.checks import ends_in, needs_extra, one_of
 from retwin.compiler import c_source, compilers
 from retwin.deploy.fmu.description import build_description, description, token_of
 from retwin.deploy.fmu.states import states_text
@@ -111,13 +111,7 @@ def export_fmu(
     fmpy = needs_extra("fmpy", "fmu", "holds the headers of FMI")
     one_of("version", version, VERSIONS)
     path = Path(path)
-    require(
-        path.suffix == ".fmu",
-        "path",
-        expected="a file *.fmu",
-        got=str(path),
-        remedy="give a name that ends with .fmu",
-    )
+    ends_in("path", path, (".fmu",), remedy="give a name that ends with .fmu")
     text = _text(twin, commands)
     identifier = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"twin_{identifier}"

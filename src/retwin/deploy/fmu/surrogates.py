@@ -86,10 +86,7 @@ def surrogate_text(twin: Surrogate | CorrectedTwin, commands: NDArray | None = N
 def _commands(
     surrogate: Surrogate,
 ) -> tuple[list[float], list[tuple[float, float]] | None, list[str]]:
-    """Commands before any are given, those of the training, and what is outside as C text.
-
-    A range that was not computed from commands, of an older model, has no speeds.
-    """
+    """Commands before any are given, those of the training, and what is outside as C text."""
     trained, mean = surrogate.trained, surrogate.before.mean.double().numpy()
     if trained is None:
         return mean.tolist(), None, []

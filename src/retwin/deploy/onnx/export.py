@@ -32,7 +32,7 @@ from retwin.deploy.onnx.portable import padded_times
 from retwin.diagnosis import NetworkDiagnoser
 from retwin.diagnosis.features import SETTLED
 from retwin.nets.networks import MLP, TCN
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.serialisation.models import write_model
 from retwin.serialisation.places import check_place
 from retwin.twins.samplers import RampSampler
@@ -107,7 +107,7 @@ def export_onnx(
     check_place(folder, folder=True, holds=("model.json", SUMS, *names))
     parity = {}
     with write_model(folder, "portable", _about(bundle), {}) as inside:
-        for done, (name, graph) in enumerate(graphs.items()):
+        for name, graph in tracked(graphs.items(), len(graphs), progress):
             _write(graph, inside / f"{name}.onnx")
             parity[name] = _difference(graph, inside / f"{name}.onnx")
             require(
@@ -117,8 +117,6 @@ def export_onnx(
                 got=f"a difference of {parity[name]:.2g}",
                 remedy="predict with torch, and report this: the graph is wrong",
             )
-            if progress is not None:
-                progress((done + 1) / len(graphs))
         seal(inside)
     return parity
 

@@ -159,7 +159,7 @@ class Portable:
         options.intra_op_num_threads = threads
         options.log_severity_level = 4  # errors are raised, and need not be printed too
         with open_sealed(folder, "portable") as about:
-            facts = Facts.of(about, sample_rate("rate", about["rate"]))
+            facts = Facts.of(about)
             sensor, classifier = about["sensor"], about["diagnoser"]
             sensor = None if sensor is None else Sensor.of(sensor, facts.steps)
             classifier = None if classifier is None else Classifier.of(classifier, facts.steps)

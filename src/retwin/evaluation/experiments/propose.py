@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from retwin.checks import at_least, finite, instance, require, whole
-from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.checks import agree, at_least, finite, instance, require, whole
+from retwin.data.trajectories import Trajectories
 from retwin.evaluation.experiments.actuators import ActuatorKnowledge
 from retwin.evaluation.experiments.dynamics import DynamicsKnowledge
 from retwin.evaluation.experiments.segments import SegmentKnowledge
@@ -183,7 +183,7 @@ def next_experiments(
     _check(twin, sampler, count, candidates)
     finite("tolerance", tolerance, least=1e-6, most=10)
     rng = np.random.default_rng(checked_seed(seed))
-    healthy = calibration[np.flatnonzero(np.isin(calibration.labels, [HEALTHY, ""]))]
+    healthy = calibration[calibration.maybe_healthy]
     remedy = "record any healthy ones first"
     least = 1 if isinstance(twin, DynamicsTwin) else MIN_TRAJECTORIES
     at_least("calibration", healthy, least, "healthy trajectories", remedy=remedy)
@@ -233,13 +233,8 @@ def _check(twin: object, sampler: CommandSampler, count: int, candidates: int) -
             got=f"{type(twin.residual.correction).__name__}, with one per sample",
             remedy="fit it with CommandSpace or DelayOffset",
         )
-    require(
-        sampler.rate == twin.rate,
-        "sampler",
-        expected=f"commands at the rate of the twin, {twin.rate:g} Hz",
-        got=f"{sampler.rate:g} Hz",
-        remedy="give the sampler of the case that the twin was fitted for",
-    )
+    remedy = "give the sampler of the case that the twin was fitted for"
+    agree("sampler", sampler, twin, "that of the twin", names=("rate",), remedy=remedy)
 
 
 def _joined(parts: list[torch.Tensor]) -> torch.Tensor:

@@ -16,7 +16,7 @@ from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.evaluation.fidelity.figures import BINS, Fidelity
 from retwin.evaluation.fidelity.latents import shown_latents
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.scores.distributions import (
     LEVELS,
     crps,
@@ -100,7 +100,7 @@ def measure_fidelity(
     operator = _operator(twin, trajectories, segments)
     seeds = np.random.SeedSequence(seed).generate_state(2 * len(trajectories)).reshape(-1, 2)
     rows: list[dict[str, Any]] = []
-    for i, (twin_seed, tie_seed) in enumerate(seeds.tolist()):
+    for i, (twin_seed, tie_seed) in tracked(enumerate(seeds.tolist()), len(seeds), progress):
         one = trajectories[[i]]
         ensemble = _Ensemble.simulated(twin, one, draws, twin_seed, stride)
         row = ensemble.scores(np.random.default_rng(tie_seed))
@@ -110,8 +110,6 @@ def measure_fidelity(
         members = ensemble.members[: INFERRED + 1]
         row["segment_values"] = _segment_values(twin, members, segments[[i]], stride, operator)
         rows.append(row)
-        if progress is not None:
-            progress((i + 1) / len(trajectories))
     rivals = {
         name: (
             np.stack([row[f"rival/{name}"][0] for row in rows]),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.evaluation.fidelity.latents import shown_latents
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.scores.distributions import quantiles
 from retwin.serialisation.files import write_atomically
 from retwin.update.corrected import CorrectedTwin
@@ -127,11 +127,9 @@ def predictive_overlay(
     stride = max(1, round(trajectories.rate / rate))
     seeds = np.random.SeedSequence(seed).generate_state(len(trajectories)).tolist()
     bands = []
-    for i, twin_seed in enumerate(seeds):
+    for i, twin_seed in tracked(enumerate(seeds), len(seeds), progress):
         commands = np.repeat(trajectories.commands[[i]], draws, axis=0)
         bands.append(quantiles(twin.simulate(commands, seed=twin_seed).observed[:, ::stride]))
-        if progress is not None:
-            progress((i + 1) / len(trajectories))
     z, deviation = _discrepancies(twin, trajectories, segments)
     latent, factor = shown_latents(
         twin.residual.correction.latent(twin.inputs, twin.outputs), trajectories.rate

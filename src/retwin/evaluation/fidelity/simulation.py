@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.scores.distributions import central_band, crps, inside, log_score, quantiles
 from retwin.serialisation.files import write_atomically
 from retwin.twins.twin import Twin
@@ -132,7 +132,7 @@ def simulate_records(
     seeds = np.random.SeedSequence(seed).generate_state(len(records)).tolist()
     measured = np.where(records.mask, records.observed, np.nan).astype(np.float64)
     means, bands, scores, densities = [], [], [], []
-    for i, twin_seed in enumerate(seeds):
+    for i, twin_seed in tracked(enumerate(seeds), len(seeds), progress):
         commands = np.repeat(records.commands[[i]], 1 if once else draws, axis=0)
         made = twin.simulate(commands, seed=twin_seed).observed.astype(np.float64)
         if once:
@@ -141,8 +141,6 @@ def simulate_records(
         bands.append(quantiles(made))
         scores.append(crps(measured[i], made))
         densities.append(log_score(measured[i], made))
-        if progress is not None:
-            progress((i + 1) / len(records))
     arrays = map(np.stack, (means, bands, scores, densities))
     return Simulation(records.ids, measured, *arrays)
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from retwin.checks import needs_extra, require
+from retwin.checks import needs_extra, require, same_names
 from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
 from retwin.monitor.gate import Gate
@@ -85,13 +85,8 @@ class OpcUa(Source):
         self._begun: dict[Any, Any] = {}
         """By node, the number of the subscription that has sent its present value."""
         for asset, nodes in settings.nodes.items():
-            require(
-                set(nodes) == set(channels[asset]),
-                f"sources.nodes.{asset}",
-                expected=f"a node for each of {', '.join(channels[asset])}",
-                got=", ".join(nodes) or "none",
-                remedy='write for each channel NAME = "ns=2;s=NODE"',
-            )
+            where, remedy = f"sources.nodes.{asset}", 'write for each channel NAME = "ns=2;s=NODE"'
+            same_names(where, nodes, channels[asset], "a node for each of", remedy=remedy)
             for name, text in nodes.items():
                 place = (asset, list(channels[asset]).index(name))
                 self._used.setdefault(self._node(text), []).append(place)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, number
-from retwin.checks import needs_extra, require
+from retwin.checks import needs_extra, require, same_names
 from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
 from retwin.monitor.settings import FolderSource
@@ -91,13 +91,8 @@ def layout_of(settings: FolderSource, channels: Sequence[str], case: Case | None
     columns = settings.columns or _same(
         [dict(each.columns) for each in known], "columns", {name: name for name in channels}
     )
-    require(
-        set(columns) == set(channels),
-        "sources.columns",
-        expected=f"a column for each of {', '.join(channels)}",
-        got=", ".join(columns),
-        remedy='write for each channel NAME = "COLUMN"',
-    )
+    remedy = 'write for each channel NAME = "COLUMN"'
+    same_names("sources.columns", columns, channels, "a column for each of", remedy=remedy)
     clocks = [each.clock for each in known if each.clock is not None]
     time = settings.time or _same([each.column for each in clocks], "time", "time")
     unit = settings.unit or _same([each.unit for each in clocks], "unit", "s")

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.evaluation.identification import Identification
-from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Row
-from retwin.scores.residuals import (
-    Correlogram,
-    autocorrelation,
-    cross_correlation,
-    decorrelated_after,
-    spectra,
+from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row
+from retwin.report.residual_panels import (
+    WHITE,
+    ChannelRecords,
+    Errors,
+    autocorrelation_panel,
+    cross_correlation_panel,
+    spectrum_panel,
 )
 
 OUTPUTS, INPUTS = 6, 3
 """Outputs and inputs of which figures are drawn, at most."""
 SAMPLES = 1500
 """Samples of a record that are drawn, at most."""
-POINTS = 241
-"""Lags that are drawn, at most."""
 BEFORE, AFTER, MEASURED = "c1", "c0", "ink"
 KEYS = (Key("before", BEFORE, "dash"), Key("after", AFTER))
 ROW_HEIGHT, MARGIN = 34, 80
@@ -41,9 +38,7 @@ def figures(found: Identification) -> dict[str, Figure]:
     made = [
         _estimates(found),
         _records(found, shown),
-        _autocorrelations(measured, errors, shown),
-        _cross_correlations(measured, errors, shown),
-        _spectra(measured, errors, shown),
+        *_residuals(measured, errors, shown),
     ]
     return {each.name: each for each in made if each.panels}
 
@@ -133,100 +128,35 @@ def _typical(measured: Trajectories, after: NDArray) -> int:
     return int(known[np.argsort(mean[known])[(len(known) - 1) // 2]])
 
 
+def _residuals(
+    measured: Trajectories, errors: list[NDArray], shown: list[int]
+) -> tuple[Figure, ...]:
+    """Correlations and spectra of the residuals after and before, of outputs that have some."""
+    about, rate = measured.outputs, measured.rate
+    drawn = []
+    for i in shown:
+        pair = [each[..., i] for each in errors]
+        if all(map(_useful, pair)):
+            values = np.where(measured.mask[..., i], measured.observed[..., i], np.nan)
+            unit = "" if about.units[i] == "1" else about.units[i]
+            output = ChannelRecords(about.names[i], unit, values.astype(float))
+            drawn.append(Errors(output, dict(zip(reversed(KEYS), reversed(pair), strict=True))))
+    commands = [
+        ChannelRecords(name, "", measured.commands[..., j].astype(float))
+        for j, name in enumerate(measured.inputs.names[:INPUTS])
+        if np.ptp(measured.commands[..., j]) > 0
+    ]
+    limits = [Key(f"95 % limits, {key.text}", key.colour, "bar") for key in KEYS]
+    crossed = [cross_correlation_panel(each, of, rate) for each in drawn for of in commands]
+    densities = [spectrum_panel(each, rate) for each in drawn]
+    return (
+        Figure("autocorrelation", [autocorrelation_panel(e, rate) for e in drawn], [*KEYS, WHITE]),
+        Figure("crosscorrelation", crossed, [*KEYS, *limits]),
+        Figure("spectra", [e for e in densities if e], [Key("measured output", MEASURED), *KEYS]),
+    )
+
+
 def _useful(residual: NDArray) -> bool:
     """Whether correlations of a residual are defined."""
     values = residual[np.isfinite(residual)]
     return len(values) > 16 and bool(np.ptp(values) > 0)
-
-
-def _pairs(errors: list[NDArray], shown: list[int]) -> Iterator[tuple[int, list[NDArray]]]:
-    """The useful residuals (n, T) of each output, before and after."""
-    for i in shown:
-        pair = [each[..., i] for each in errors]
-        if all(map(_useful, pair)):
-            yield i, pair
-
-
-def _autocorrelations(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> Figure:
-    panels = []
-    for i, pair in _pairs(errors, shown):
-        lags = decorrelated_after(pair[1])
-        found = [autocorrelation(each, lags) for each in pair]
-        panels.append(_correlation(measured.outputs.names[i], "lag", found, measured.rate))
-    return Figure("autocorrelation", panels, [*KEYS, _LIMITS])
-
-
-def _cross_correlations(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> Figure:
-    panels = []
-    for i, pair in _pairs(errors, shown):
-        for j, name in enumerate(measured.inputs.names[:INPUTS]):
-            command = measured.commands[..., j].astype(float)
-            if np.ptp(command) == 0:
-                continue
-            found = [cross_correlation(each, command) for each in pair]
-            title = f"{measured.outputs.names[i]} with {name}"
-            panels.append(_correlation(title, f"time after {name}", found, measured.rate))
-    return Figure("crosscorrelation", panels, [*KEYS, _LIMITS])
-
-
-_LIMITS = Key("95 % limits without correlation", "grid", "bar")
-
-
-def _correlation(title: str, lag: str, found: list[Correlogram], rate: float) -> Panel:
-    """The correlations before and after, with the limits after."""
-    before, after = (each.thinned(POINTS) for each in found)
-    x = after.lags / rate
-    marks: list[Mark] = [
-        Band(x, -after.limits, after.limits, "limits", "muted", 0.25),
-        Line(x, before.values, "before", BEFORE, "dash", 1.4),
-        Line(x, after.values, "after", AFTER, width=1.8),
-    ]
-    y = Axis("correlation", "", (-1.05, 1.05), step=0.5)
-    return Panel(Axis(lag, "s"), [Row(y, marks)], f"Correlation of {title}", title, height=280)
-
-
-def _spectra(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> Figure:
-    """Spectra of the measured output and of the residuals, on logarithmic axes."""
-    panels = []
-    for i in shown:
-        values = np.where(measured.mask[..., i], measured.observed[..., i], np.nan).astype(float)
-        if not _useful(values) or not _useful(errors[1][..., i]):
-            continue
-        frequency, found = spectra([values, *(each[..., i] for each in errors)], measured.rate)
-        if not len(frequency):
-            continue
-        density = np.maximum(found, 1e-12 * found.max())
-        unit = measured.outputs.units[i]
-        unit = "1/Hz" if unit == "1" else f"({unit})²/Hz"
-        marks: list[Mark] = [
-            Line(frequency, density[0], "measured output", MEASURED, width=1.8, alpha=0.45),
-            Line(frequency, density[1], "residual before", BEFORE, "dash", 1.4),
-            Line(frequency, density[2], "residual after", AFTER, width=1.8),
-        ]
-        name = measured.outputs.names[i]
-        panels.append(
-            Panel(
-                _powers("frequency", "Hz", frequency),
-                [Row(_powers("density", unit, density), marks)],
-                f"Spectra of {name} and of its residuals",
-                name,
-                height=300,
-            )
-        )
-    keys = [
-        Key("measured output", MEASURED),
-        Key("residual before", BEFORE, "dash"),
-        Key("residual after", AFTER),
-    ]
-    return Figure("spectra", panels, keys)
-
-
-def _powers(label: str, unit: str, values: NDArray) -> Axis:
-    """A logarithmic axis with ticks at 1, 2 and 5, or at powers of ten where there are many."""
-    low, high = np.log10(values.min()), np.log10(values.max())
-    powers = np.arange(np.floor(low), np.ceil(high) + 1)
-    powers = powers[:: max(1, -(-len(powers) // 8))]
-    steps = (1.0, 2.0, 5.0) if high - low < 2 else (1.0,)
-    places = [step * 10.0**power for power in powers.tolist() for step in steps]
-    kept = [each for each in places if values.min() <= 1.01 * each and each <= 1.01 * values.max()]
-    return Axis(label, unit, kind="log", ticks={each: f"{each:g}" for each in kept})

@@ -9,7 +9,7 @@ from typing import Any
 
 from retwin.evaluation.identification import Identification, RMSError
 from retwin.report.assets import environment, plotly_js, script_json
-from retwin.report.blocks import Cell, Column, Table, columns
+from retwin.report.blocks import Cell, Column, Table, columns, grouped
 from retwin.report.identification.figures import INPUTS, OUTPUTS, figures
 from retwin.report.identification.texts import (
     change,
@@ -170,9 +170,8 @@ def _errors(found: Identification) -> Table:
             ]
         rows.append(row)
     group = ("before", "after", "of the mean's", "change")
-    heads = [Column("output", numeric=False), Column("record's mean")]
-    heads += [Column(text, "measurements used") for text in group]
-    heads += [Column(text, "held out") for text in group] if held else []
+    heads = [*columns("output", "record's mean"), *grouped("measurements used", *group)]
+    heads += grouped("held out", *group) if held else []
     what = "free simulation"
     if isfinite(found.horizon):
         what = f"predictions over {found.horizon:.3g} s"
@@ -210,13 +209,8 @@ def _tests(found: Identification) -> Table:
                 Cell(p_value(first.p_value) if first else "–"),
             ]
         )
-    heads = [
-        Column("output", numeric=False),
-        Column("p", "white noise"),
-        Column("next sample", "white noise"),
-        Column("command", "strongest dependence on a command", numeric=False),
-        Column("correlation", "strongest dependence on a command"),
-        Column("lag", "strongest dependence on a command"),
-        Column("p", "strongest dependence on a command"),
-    ]
+    strongest = "strongest dependence on a command"
+    heads = [*columns("output"), *grouped("white noise", "p", "next sample")]
+    heads += [Column("command", strongest, numeric=False)]
+    heads += grouped(strongest, "correlation", "lag", "p")
     return Table("Tests of the residuals after identification", heads, rows)

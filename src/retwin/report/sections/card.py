@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 from urllib.parse import quote
 
-from retwin.report.blocks import Cell, Column, Link, Section, Table
+from retwin.report.blocks import Cell, Link, Section, Table, columns
 from retwin.report.labels import class_name, counted, latent_names, quantity, real_data, source_name
 from retwin.report.study import Study
 from retwin.report.verdict import headline
@@ -171,14 +171,8 @@ def _data(study: Study) -> Table | None:
     rows = [
         _data_row(role, each) for role, each in roles.items() if each.n is not None or each.sha256
     ]
-    columns = [
-        Column("Role", numeric=False),
-        Column("File", numeric=False),
-        Column("Trajectories"),
-        Column("used"),
-        Column("SHA-256", numeric=False),
-    ]
-    return Table("Data", columns, rows) if rows else None
+    heads = columns("Role", "File", "Trajectories", "used", "SHA-256", texts=("File", "SHA-256"))
+    return Table("Data", heads, rows) if rows else None
 
 
 def _data_row(role: str, each: Dataset) -> list[Cell]:

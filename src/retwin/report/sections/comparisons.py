@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from retwin.catalog import METRICS
-from retwin.report.blocks import Cell, Column, Forest, Section, Table
+from retwin.report.blocks import Cell, Column, Forest, Section, Table, columns, grouped
 from retwin.report.labels import (
     MANY,
     SELECTED,
@@ -87,17 +87,9 @@ def _axes(study: Study, found: Sequence[Comparison]) -> dict[str, tuple[float, f
 
 
 def _pairs(study: Study, found: Sequence[Comparison]) -> Table:
-    columns = [
-        Column("Score", numeric=False),
-        Column("Outcome", numeric=False),
-        Column("Difference"),
-        Column("95 % interval"),
-        Column("", numeric=False),
-        Column("p, all pairs"),
-        Column("t (df)", group="Welch’s test over runs"),
-        Column("p", group="Welch’s test over runs"),
-        Column("p, Holm", group="Welch’s test over runs"),
-    ]
+    names = "Outcome", "Difference", "95 % interval", "", "p, all pairs"
+    heads = columns("Score", *names, texts=("Outcome", ""))
+    heads += grouped("Welch’s test over runs", "t (df)", "p", "p, Holm")
     units = study.results.outputs.units
     rows: list[list[Cell]] = []
     last: tuple[str, str] | None = None
@@ -109,7 +101,7 @@ def _pairs(study: Study, found: Sequence[Comparison]) -> Table:
         last = each.a, each.b
         axis = axes.get(metric_quantity(each.metric, units)[1], (0.0, 0.0))
         rows.append(_row(each, units, axis))
-    return Table("Differences, pair by pair", columns, rows)
+    return Table("Differences, pair by pair", heads, rows)
 
 
 def _sorted(found: Sequence[Comparison]) -> list[Comparison]:

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from retwin.data.trajectories import HEALTHY
-from retwin.report.blocks import Cell, Column, Section, Table
+from retwin.report.blocks import Cell, Section, Table, columns, grouped
 from retwin.report.labels import class_name, distinct, number, percent, percents, source_name
 from retwin.report.lights import RATES, alarms
 from retwin.report.study import Study
@@ -16,6 +16,9 @@ from retwin.scores.decisions import Decision, decide
 TRAJECTORIES, FAULTY, MISSED = 1000, 0.02, 50
 """The example: trajectories, share of faulty ones, cost of a missed fault in false alarms."""
 GROUP = f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty"
+DETECTED = ("Faults detected", "Detected at the rate", "of these, correct class")
+TEXTS = ("Most often missed", "Most often confused")
+"""Heads of columns of numbers and of classes."""
 
 
 def decisions(study: Study) -> Section | None:
@@ -60,14 +63,8 @@ def _decide(study: Study, source: str, rate: float) -> Decision:
 
 def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
     """A row per source at the same false-alarm rate."""
-    columns = [
-        Column("Source", numeric=False),
-        Column("Faults detected"),
-        Column("Detected at the rate"),
-        Column("of these, correct class"),
-        Column("Most often missed", numeric=False),
-        Column(f"cost, 1 : {MISSED}", group=GROUP),
-    ]
+    heads = columns("Source", *DETECTED, "Most often missed", texts=TEXTS)
+    heads += grouped(GROUP, f"cost, 1 : {MISSED}")
     found = {name: _decide(study, name, rate) for name in sources}
     best = max(each.detected for each in found.values())
     rows = []
@@ -83,26 +80,16 @@ def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
                 Cell(number(cost.total, 0)),
             ]
         )
-    return Table("All sources at the same false-alarm rate", columns, rows)
+    return Table("All sources at the same false-alarm rate", heads, rows)
 
 
 def _table(source: str, found: list[Decision]) -> Table:
-    columns = [
-        Column("Requested false-alarm rate", numeric=False),
-        Column("Alarm threshold"),
-        Column("Its false alarms"),
-        Column("Faults detected"),
-        Column("Detected at the rate"),
-        Column("of these, correct class"),
-        Column("Most often missed", numeric=False),
-        Column("Most often confused", numeric=False),
-        Column("false alarms", group=GROUP),
-        Column("missed faults", group=GROUP),
-        Column(f"cost, 1 : {MISSED}", group=GROUP),
-    ]
+    names = "Alarm threshold", "Its false alarms", *DETECTED, *TEXTS
+    heads = columns("Requested false-alarm rate", *names, texts=TEXTS)
+    heads += grouped(GROUP, "false alarms", "missed faults", f"cost, 1 : {MISSED}")
     digits = distinct(each.threshold for each in found)
     title = f"Cost of a false-alarm rate, {source_name(source)}"
-    return Table(title, columns, [_row(each, digits) for each in found])
+    return Table(title, heads, [_row(each, digits) for each in found])
 
 
 def _row(each: Decision, digits: int) -> list[Cell]:

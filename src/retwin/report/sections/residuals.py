@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.arrays import runs
 from retwin.report.blocks import Cell, Section, Table, columns
-from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Row, Spans
+from retwin.report.figure import Axis, Figure, Key, Mark, Panel, Points, Row, Spans
 from retwin.report.labels import decimals, number, p_value, quantity, source_name, with_unit
+from retwin.report.residual_panels import (
+    WHITE,
+    ChannelRecords,
+    Errors,
+    autocorrelation_panel,
+    cross_correlation_panel,
+    line,
+    log_axis,
+    spectrum_panel,
+)
 from retwin.report.study import Study
 from retwin.report.style import colour_of, dash
 from retwin.scores.residuals import (
@@ -22,34 +32,14 @@ from retwin.scores.residuals import (
     error_by_amplitude,
     ljung_box,
     rms_over_time,
-    spectra,
 )
 
 OUTPUTS = 3
 """Outputs of which figures are drawn, at most."""
 COMMANDS = 3
 """Commands of which figures are drawn, at most."""
-POINTS = 241
-"""Lags that a figure shows, at most."""
 BLOCKS = 40
 """Blocks of the error over time."""
-WHITE = Key("95 % limits of white noise", "muted", "bar")
-
-
-@dataclass(frozen=True)
-class ChannelRecords:
-    """A command or an output of all records: values (n, T), range in calibration."""
-
-    name: str
-    unit: str
-    values: NDArray
-    low: float
-    high: float
-
-    @property
-    def outside(self) -> NDArray:
-        """Whether a value is outside that range (n, T)."""
-        return (self.values < self.low) | (self.values > self.high)
 
 
 @dataclass(frozen=True)
@@ -59,14 +49,10 @@ class OutputErrors:
     output: ChannelRecords
     by_source: Mapping[str, NDArray]
 
-    def of(self, sources: Iterable[str]) -> OutputErrors:
-        """The errors of some sources alone."""
-        return OutputErrors(self.output, {name: self.by_source[name] for name in sources})
-
-    @cached_property
-    def lags(self) -> int:
-        """Lags up to which correlations are shown, by the first source."""
-        return decorrelated_after(next(iter(self.by_source.values())))
+    def of(self, sources: Iterable[str]) -> Errors:
+        """The errors of some sources, by their keys."""
+        keys = {name: Key(source_name(name), colour_of(name), dash(name)) for name in sources}
+        return Errors(self.output, {key: self.by_source[name] for name, key in keys.items()})
 
 
 def residuals(study: Study) -> Section | None:
@@ -91,15 +77,15 @@ def residuals(study: Study) -> Section | None:
 
 
 def _figures(
-    study: Study, errors: list[OutputErrors], commands: list[ChannelRecords], outside: NDArray
+    study: Study, errors: list[Errors], commands: list[ChannelRecords], outside: NDArray
 ) -> list[Figure]:
     """All figures, of the first outputs and commands."""
     ranged = any(np.isfinite([each.output.low, each.output.high]).any() for each in errors)
     rate, errors, drawn = _rate(study), errors[:OUTPUTS], commands[:COMMANDS]
-    keys = [Key(source_name(name), colour_of(name), dash(name)) for name in errors[0].by_source]
+    keys = list(errors[0].by_key)
     limits = [Key(f"95 % limits, {key.text}", key.colour, "bar") for key in keys]
-    correlated = [_cross_correlation(each, of, rate) for each in errors for of in drawn]
-    densities = [_spectrum(each, rate) for each in errors]
+    correlated = [cross_correlation_panel(each, of, rate) for each in errors for of in drawn]
+    densities = [spectrum_panel(each, rate) for each in errors]
     amplitudes = [_amplitudes(each, of) for each in errors for of in (each.output, *drawn)]
     beyond, late = (
         [Key("outside the range of the calibration", "grid", "bar")] * bool(known)
@@ -107,7 +93,7 @@ def _figures(
     )
     over_time = [_over_time(each, np.any(outside, axis=0), rate) for each in errors]
     return [
-        Figure("autocorrelation", [_autocorrelation(e, rate) for e in errors], [*keys, WHITE]),
+        Figure("autocorrelation", [autocorrelation_panel(e, rate) for e in errors], [*keys, WHITE]),
         Figure("crosscorrelation", correlated, [*keys, *limits]),
         Figure("spectra", [e for e in densities if e], [Key("measured output", "ink"), *keys]),
         Figure("amplitude", [e for e in amplitudes if e], [*keys, *beyond]),
@@ -166,8 +152,9 @@ def _table(
     for each in errors:
         if len(errors) > 1:
             rows.append([Cell(with_unit(each.output.name, each.output.unit))])
+        lags = decorrelated_after(next(iter(each.by_source.values())))
         for source, error in each.by_source.items():
-            found = _row(error, commands, each.lags, outside, _rate(study))
+            found = _row(error, commands, lags, outside, _rate(study))
             rows.append([Cell(source_name(source), source=source), *found])
     title, output = "Residuals of all sources", errors[0].output
     return Table(title if len(errors) > 1 else with_unit(title, output.unit), heads, rows)
@@ -214,67 +201,10 @@ def _at_lag(found: Correlogram, rate: float, command: str = "") -> tuple[str, st
     return number(found.values[i], 2), f"{where}; limit {number(found.limits[i], 2)}"
 
 
-def _autocorrelation(errors: OutputErrors, rate: float) -> Panel:
-    found = {
-        s: autocorrelation(e, errors.lags).thinned(POINTS) for s, e in errors.by_source.items()
-    }
-    first = next(iter(found.values()))
-    x = first.lags / rate
-    marks: list[Mark] = [Band(x, -first.limits, first.limits, WHITE.text, "muted", 0.25)]
-    marks += [_line(x, each.values, source) for source, each in found.items()]
-    return Panel(
-        Axis("lag", "s"),
-        [Row(Axis("autocorrelation", limits=(-1.05, 1.05), step=0.5), marks)],
-        f"Autocorrelation of the error of {errors.output.name}",
-        errors.output.name,
-        height=300,
-    )
-
-
-def _cross_correlation(errors: OutputErrors, command: ChannelRecords, rate: float) -> Panel:
-    marks: list[Mark] = []
-    largest = 0.0
-    for source, each in errors.by_source.items():
-        found = cross_correlation(each, command.values, errors.lags).thinned(POINTS)
-        x, colour = found.lags / rate, colour_of(source)
-        name = f"95 % limits, {source_name(source)}"
-        marks.append(Band(x, -found.limits, found.limits, name, colour, 0.18))
-        marks.append(_line(x, found.values, source))
-        both = np.concatenate([np.abs(found.values), found.limits])
-        largest = float(max(largest, *both[np.isfinite(both)], 0.0))
-    y = Axis("correlation", limits=(-1.1 * largest, 1.1 * largest) if largest > 0 else None)
-    return Panel(
-        Axis("time by which the command is earlier", "s"),
-        [Row(y, marks)],
-        f"Correlation of the error of {errors.output.name} with {command.name}",
-        f"{errors.output.name}, {command.name}",
-        height=300,
-    )
-
-
-def _spectrum(errors: OutputErrors, rate: float) -> Panel | None:
-    """None where no part of the records is measured without a hole."""
-    output = errors.output
-    frequencies, (signal, *others) = spectra([output.values, *errors.by_source.values()], rate)
-    if not len(frequencies):
-        return None
-    marks: list[Mark] = [Line(frequencies, np.sqrt(signal), "measured", "ink", width=1.4)]
-    for source, each in zip(errors.by_source, others, strict=True):
-        marks.append(_line(frequencies, np.sqrt(each), source))
-    unit = f"{output.unit}/√Hz" if output.unit else "1/√Hz"
-    return Panel(
-        _log("frequency", "Hz", frequencies),
-        [Row(_log("spectral density", unit, np.sqrt([signal, *others])), marks)],
-        f"Spectrum of {output.name} and of its errors",
-        output.name,
-        height=340,
-    )
-
-
-def _amplitudes(errors: OutputErrors, of: ChannelRecords) -> Panel | None:
+def _amplitudes(errors: Errors, of: ChannelRecords) -> Panel | None:
     """The error by the value of a channel; None where nothing was measured."""
     ends = (of.low, of.high)
-    found = {s: error_by_amplitude(e, of.values, ends) for s, e in errors.by_source.items()}
+    found = {s: error_by_amplitude(e, of.values, ends) for s, e in errors.by_key.items()}
     bins = next(iter(found.values()))
     if not len(bins.rms):
         return None
@@ -282,26 +212,27 @@ def _amplitudes(errors: OutputErrors, of: ChannelRecords) -> Panel | None:
     beyond = [(least, min(of.low, most))] * (least < of.low)
     beyond += [(max(of.high, least), most)] * (of.high < most)
     marks: list[Mark] = [Spans(beyond)] if beyond else []
-    for source, each in found.items():
-        marks.append(_points(each.centre, each.rms, source))
+    for key, each in found.items():
+        x, y = each.centre, each.rms
+        marks.append(Points(x, y, key.text, key.colour, dash=key.mark, size=6))
     name, unit = errors.output.name, errors.output.unit
     return Panel(
         Axis(of.name, of.unit),
-        [Row(_log("RMS error", unit, [each.rms for each in found.values()]), marks)],
+        [Row(log_axis("RMS error", unit, [each.rms for each in found.values()]), marks)],
         f"Error of {name} by the value of {of.name}",
         f"{name} by {of.name}",
         height=320,
     )
 
 
-def _over_time(errors: OutputErrors, outside: NDArray, rate: float) -> Panel:
+def _over_time(errors: Errors, outside: NDArray, rate: float) -> Panel:
     """The error over time, and where a channel of any record is outside (T,)."""
-    found = {source: rms_over_time(e, BLOCKS) for source, e in errors.by_source.items()}
+    found = {key: rms_over_time(e, BLOCKS) for key, e in errors.by_key.items()}
     edges = next(iter(found.values()))[0] / rate
     marks: list[Mark] = [Spans(list(_runs(outside, edges, rate)))] if outside.any() else []
-    for source, (_, rms) in found.items():
-        marks.append(_line((edges[1:] + edges[:-1]) / 2, rms, source))
-    y = _log("RMS error", errors.output.unit, [rms for _, rms in found.values()])
+    for key, (_, rms) in found.items():
+        marks.append(line((edges[1:] + edges[:-1]) / 2, rms, key))
+    y = log_axis("RMS error", errors.output.unit, [rms for _, rms in found.values()])
     return Panel(
         Axis("time", "s", (0, edges[-1]), count=8),
         [Row(y, marks)],
@@ -314,32 +245,5 @@ def _over_time(errors: OutputErrors, outside: NDArray, rate: float) -> Panel:
 def _runs(outside: NDArray, edges: NDArray, rate: float) -> Iterator[tuple[float, float]]:
     """Spans of time of the blocks with a sample outside; neighbours are one span."""
     starts = np.round(edges * rate).astype(int)
-    held = np.add.reduceat(outside, starts[:-1]) > 0
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
-    for first, last in ends.reshape(-1, 2).tolist():
+    for first, last in runs(np.add.reduceat(outside, starts[:-1]) > 0):
         yield float(edges[first]), float(edges[last])
-
-
-def _line(x: NDArray, y: NDArray, source: str) -> Line:
-    return Line(x, y, source_name(source), colour_of(source), dash(source), 1.6)
-
-
-def _points(x: NDArray, y: NDArray, source: str) -> Points:
-    return Points(x, y, source_name(source), colour_of(source), dash=dash(source), size=6)
-
-
-def _log(label: str, unit: str, values: object) -> Axis:
-    """A logarithmic axis with ticks at 1, 2 and 5, or at powers of 10 where there are many.
-
-    It is linear where no value is above 0.
-    """
-    every = np.asarray(values, dtype=float)
-    positive = every[np.isfinite(every) & (every > 0)]
-    if not positive.size:
-        return Axis(label, unit)
-    low, high = np.log10(positive.min()), np.log10(positive.max())
-    powers = np.arange(np.floor(low), np.ceil(high) + 1)
-    steps = (1.0, 2.0, 5.0) if high - low < 2 else (1.0,)
-    places = np.array([step * 10.0**power for power in powers for step in steps])
-    kept = places[(places >= 0.8 * 10**low) & (places <= 1.25 * 10**high)]
-    return Axis(label, unit, kind="log", ticks={float(each): f"{each:g}" for each in kept})

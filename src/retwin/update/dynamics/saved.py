@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retwin.checks import finite, one_of, require
+from retwin.checks import one_of, require
 from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state_twin import StateTwin
@@ -62,14 +62,6 @@ def read_fields(folder: str | Path) -> dict[str, Any]:
     about, weights = read_model(folder, KIND)
     with refusing(folder, expected="corrected dynamics"):
         equations = equations_from(StateTwin, about["equations"])
-        process = weights["process"]
-        # Models of earlier versions had process noise of one kind, and one factor for all outputs.
-        earlier = {"proportional": 0 * process, "free_process": process}
-        if "widening" in about:
-            factor = finite("widening", about["widening"], least=0.0)
-            earlier["widening"] = torch.full_like(weights["noise"], factor)
-        earlier["constant"] = torch.zeros_like(weights["noise"])
-        weights = earlier | weights
         arrays = {name: weights[name].double().numpy() for name in ARRAYS}
         domain = Domain(*(weights[f"domain_{name}"].double().numpy() for name in DOMAIN))
         _check(equations, arrays, domain)

@@ -16,7 +16,6 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
-from retwin.twins.command_side import DELAY, CommandSide
 from retwin.twins.faults import Fault
 from retwin.twins.noisy import sensor_sample_count
 from retwin.twins.parametric import ParametricTwin
@@ -118,11 +117,6 @@ class PosteriorTwin(TwinWrapper):
             remedy="give the twin whose posterior it is",
         )
         samples, values = drawn["samples"].numpy(), np.array(about["values"])
-        if "units" not in about and isinstance(twin.twin, CommandSide) and DELAY in twin.names:
-            # Before version 0.1.0, when units were not written, delays were in samples.
-            delay = twin.names.index(DELAY)
-            samples[:, delay] /= twin.rate
-            values[delay] /= twin.rate
         return cls(
             twin.with_values(values),
             from_config(about["noise"], (Noise,)),

@@ -15,10 +15,7 @@ KINDS: dict[str, type[Residual]] = {
 }
 
 
-def load_residual(folder: str | Path, rate: float | None = None) -> Residual:
-    """The residual model that `folder` holds, of any kind; InputError if it holds none.
-
-    `rate` in Hz is for files from before version 0.1.0 only, whose times were in samples.
-    """
+def load_residual(folder: str | Path) -> Residual:
+    """The residual model that `folder` holds, of any kind; InputError if it holds none."""
     with refusing(folder, expected="a residual model"):
-        return KINDS.get(kind_of(folder), ResidualModel).load(folder, rate)
+        return KINDS.get(kind_of(folder), ResidualModel).load(folder)

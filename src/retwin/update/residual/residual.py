@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.catalog import DENSITIES, NETWORKS, classes
+from retwin.catalog import CORRECTIONS, DENSITIES, NETWORKS, classes
 from retwin.checks import finite, one_of
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
@@ -23,7 +23,6 @@ from retwin.nets.training import Fit
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.update.corrections import Context, Correction
-from retwin.update.residual.former import read_correction, written_correction
 from retwin.update.surrogate import Surrogate
 
 
@@ -138,7 +137,7 @@ class Residual(nn.Module, ABC):
     def save(self, folder: str | Path) -> None:
         """Write the weights and the description, see `retwin.serialisation.models`."""
         about = {
-            **written_correction(self.correction),
+            "correction": to_config(self.correction, classes(CORRECTIONS)),
             "density": to_config(self.density, _densities()),
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
@@ -152,30 +151,26 @@ class Residual(nn.Module, ABC):
             pass
 
     @classmethod
-    def load(cls, folder: str | Path, rate: float | None = None) -> Self:
-        """Read what `save` wrote; `rate` in Hz is for files from before version 0.1.0 only.
+    def load(cls, folder: str | Path) -> Self:
+        """Read what `save` wrote.
 
         Raises InputError if the folder holds no such residual model or is damaged.
         """
         about, weights = read_model(folder, cls.kind)
         model = cls(
-            read_correction(about, rate),
+            from_config(about["correction"], classes(CORRECTIONS)),
             from_config(about["density"], _densities()),
             inputs=Channels.of(about["inputs"]),
             outputs=Channels.of(about["outputs"]),
-            # Development versions before 0.1.0 wrote neither for one z per sample.
-            segmentation=about.get("segmentation", "commands"),
+            segmentation=about["segmentation"],
         )
-        # Models per segment had no `spread` in development versions before 0.1.0.
-        model.load_state_dict({"spread": torch.ones_like(model.spread), **weights})
-        # Development versions before 0.1.0 had their uncertainty in `spread`.
-        degrees = about.get("degrees", [None] * len(model.sizes))
+        model.load_state_dict(weights)
         model.degrees = [
             math.inf if each is None else finite("degrees", each, least=1)
-            for each, _ in zip(degrees, model.sizes, strict=True)
+            for each, _ in zip(about["degrees"], model.sizes, strict=True)
         ]
         model.emulated = about["emulated"]
-        model.timing = np.atleast_2d(np.array(about.get("timing", []), dtype=float))
+        model.timing = np.atleast_2d(np.array(about["timing"], dtype=float))
         model.fitted = Fit.of(about["fitted"])
         return model.eval()
 

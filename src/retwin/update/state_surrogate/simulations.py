@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import at_least, require
+from retwin.checks import agree, at_least, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
@@ -51,11 +51,12 @@ def samplers_of(
     own: list[NDArray] = []
     if hasattr(commands, "sample"):
         sampler: Any = commands
-        require(
-            sampler.rate == twin.rate,
+        agree(
             "commands",
-            expected=f"a sampler at the rate of the twin, {twin.rate:g} Hz",
-            got=f"{sampler.rate:g} Hz",
+            sampler,
+            twin,
+            "that of the twin",
+            names=("rate",),
             remedy="give both the same rate",
         )
         samplers.append(sampler)

@@ -1,0 +1,219 @@
+"""Pages of a film: the picture with title, time and legend, and the chart of an updated twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, UPDATED, Pictures, Shots, rings
+
+DPI = 100
+"""Pixels per inch, by which matplotlib converts sizes."""
+VEIL = 0.88
+"""Opacity of the veil over what is not yet reached, from 0 to 1."""
+WIDE = 1.5
+"""Ratio of width to height from which on the chart is beside the picture and not below it."""
+INK, MUTED, ALARM = "#1b1f24", "#5a636e", "#8f2d00"
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """The deviation of one output from the nominal motion.
+
+    Attributes
+    ----------
+    title : str
+        The axis: output and unit.
+    time : ndarray, shape (T,)
+        Times in s.
+    observed : ndarray, shape (T,)
+        Measured minus nominal, NaN where nothing was measured.
+    drawn : ndarray, shape (draws, T)
+        Draws of the updated twin minus nominal.
+
+    """
+
+    title: str
+    time: NDArray
+    observed: NDArray
+    drawn: NDArray
+
+
+def picture_size(size: tuple[int, int], *, chart: bool) -> tuple[int, int]:
+    """Width and height in pixels of the picture in a film, which the chart leaves for it."""
+    width, height = size
+    if not chart:
+        return size
+    return (
+        (round(0.45 * width), height) if width >= WIDE * height else (width, round(0.66 * height))
+    )
+
+
+def film_pages(
+    shots: Shots, size: tuple[int, int], pictures: Pictures | None, chart: Chart | None
+) -> Iterator[NDArray]:
+    """Draw the pages of a film with matplotlib.
+
+    Parameters
+    ----------
+    shots : Shots
+        The frames.
+    size : (int, int)
+        Width and height in pixels.
+    pictures : iterable of ndarray of uint8, shape (height, width, 3), optional
+        The pictures, as large as `picture_size` states; by default stick figures are drawn.
+    chart : Chart, optional
+        The chart beside or below them, of which time uncovers more and more.
+
+    Yields
+    ------
+    ndarray of uint8, shape (height, width, 3)
+        One page per frame.
+
+    """
+    # Without pyplot, which would use a window system and global state.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    width, height = size
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
+    canvas = FigureCanvasAgg(figure)
+    inner = picture_size(size, chart=chart is not None)
+    box = (0.0, 1 - inner[1] / height, inner[0] / width, inner[1] / height)
+    text = max(9.0, min(inner[0] / 44, inner[1] / 31))
+    steps: list[Callable[[int], None]] = []
+    frames: Iterator[Any] = iter(pictures if pictures is not None else range(len(shots)))
+    image = None
+    if pictures is None:
+        steps.append(_sticks(figure, box, shots, min(inner) / 480))
+    else:
+        blank = np.zeros((inner[1], inner[0], 3), np.uint8)
+        image = figure.figimage(blank, 0, height - inner[1], origin="upper")
+    steps.append(_captions(figure, box, shots, text, size))
+    if chart is not None:
+        steps.append(_draw_chart(figure, chart, shots, size, inner))
+    for i, picture in enumerate(frames):
+        if image is not None:
+            image.set_data(picture)
+        for step in steps:
+            step(i)
+        canvas.draw()
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _captions(
+    figure: Any, box: tuple[float, ...], shots: Shots, text: float, size: tuple[int, int]
+) -> Callable[[int], None]:
+    """Write the title, the legend, and at each frame the time."""
+    x, y = text / size[0], text / size[1]
+    points = 72 * text / DPI
+    left, bottom, right, top = box[0] + x, box[1] + y, box[2] - x, box[1] + box[3] - y
+    look: dict[str, Any] = {"fontsize": points, "color": INK, "va": "top"}
+    figure.text(left, top, shots.title, weight="bold", **look, parse_math=False)
+    time = figure.text(right, top, "", ha="right", **look)
+    if shots.emulated:
+        note = "EMULATED: no real measurements"
+        figure.text(left, top - 1.5 * y, note, weight="bold", **look | {"color": ALARM})
+    legend = [
+        (SOLID, "observed: only the tip is measured, the pose is the nearest to the nominal"),
+        (GHOST, "nominal (ghost)"),
+    ]
+    if len(shots.drawn):
+        legend[0] = (SOLID, "observed; the pose is inferred from the tip")
+        legend.append((UPDATED, f"updated twin, {len(shots.drawn)} draws of the tip"))
+    for place, (colour, line) in enumerate(legend):
+        for shift, words, paint in ((0.0, "▬", colour), (2 * x, line, MUTED)):
+            where = left + shift, bottom + 1.5 * place * y
+            figure.text(*where, words, fontsize=0.9 * points, color=paint)
+    return lambda frame: time.set_text(f"{shots.seconds[frame]:.2f} s")
+
+
+def _sticks(
+    figure: Any, box: tuple[float, ...], shots: Shots, unit: float
+) -> Callable[[int], None]:
+    """Draw the two skeletons, the paths of their tips, and the draws of an updated twin."""
+    axes = figure.add_axes(box, projection="3d", facecolor=PAPER, computed_zorder=False)
+    root, reach = shots.root, shots.reach
+    axes.set(
+        xlim=(root[0] - reach, root[0] + reach),
+        ylim=(root[1] - reach, root[1] + reach),
+        zlim=(root[2], root[2] + reach),
+    )
+    axes.set_box_aspect((2, 2, 1), zoom=1.5)
+    axes.view_init(elev=18, azim=-50)
+    axes.set_axis_off()
+
+    def line(colour: Any, width: float, zorder: int, **look: Any) -> Any:
+        return axes.plot([], [], [], color=colour, linewidth=width * unit, zorder=zorder, **look)[0]
+
+    for ring in rings(root, reach):
+        line(RING, 1 / unit, 1, clip_on=False).set_data_3d(*ring.T)
+    chains = [
+        (points, line(colour, 1.2, zorder), line(colour, thick, zorder + 2, alpha=alpha))
+        for points, colour, alpha, thick, zorder in (
+            (shots.nominal_points, GHOST, 0.55, 5.0, 2),
+            (shots.observed_points, SOLID, 1.0, 4.0, 3),
+        )
+    ]
+    for _, _, chain in chains:
+        chain.set(marker="o", markersize=1.7 * chain.get_linewidth(), solid_capstyle="round")
+    trails = [line(UPDATED, 0.8, 3, alpha=0.6) for _ in shots.drawn]
+    tips = line(UPDATED, 0, 6, marker="o", markersize=3.5 * unit)
+
+    def step(frame: int) -> None:
+        for trail, path in zip(trails, shots.trails(frame), strict=True):
+            trail.set_data_3d(*path.T)
+        if trails:
+            tips.set_data_3d(*shots.drawn[:, frame].T)
+        for points, trace, chain in chains:
+            trace.set_data_3d(*points[: frame + 1, -1].T)
+            chain.set_data_3d(*points[frame].T)
+
+    return step
+
+
+def _draw_chart(
+    figure: Any,
+    chart: Chart,
+    shots: Shots,
+    size: tuple[int, int],
+    inner: tuple[int, int],
+) -> Callable[[int], None]:
+    """Draw the bands of the updated twin and what was measured, in the part beside the picture."""
+    left = inner[0] if inner[1] == size[1] else 0
+    width, height = size[0] - left, size[1] - (0 if left else inner[1])
+    text = max(5.0, min(width / 42, height / 13))
+    columns = 4 if width > 45 * text else 2
+    margins = 6 * text, 4.2 * text, (2.0 if columns == 4 else 3.5) * text
+    wide, tall = width - margins[0] - text, height - margins[1] - margins[2]
+    corners = (left + margins[0], margins[1], wide, tall)
+    axes = figure.add_axes(tuple(np.divide(corners, (*size, *size))), facecolor=PAPER)
+    points = 65 * text / DPI
+    for share, alpha in ((0.9, 0.25), (0.5, 0.4)):
+        low, high = np.quantile(chart.drawn, [(1 - share) / 2, (1 + share) / 2], axis=0)
+        look: dict[str, Any] = {"color": UPDATED, "alpha": alpha, "linewidth": 0}
+        label = f"updated twin, {100 * share:.0f} %"
+        axes.fill_between(chart.time, low, high, label=label, **look)
+    axes.axhline(0, color=GHOST, linewidth=1.2, linestyle=":", label="nominal")
+    axes.plot(chart.time, chart.observed, color=SOLID, linewidth=1.5, label="observed")
+    axes.set_xlabel("time, s", fontsize=points)
+    axes.set_ylabel(chart.title, fontsize=points, parse_math=False)
+    axes.tick_params(labelsize=points)
+    axes.spines[["top", "right"]].set_visible(False)
+    begin, end = chart.time[0], max(chart.time[-1], chart.time[0] + 1e-9)
+    axes.set_xlim(begin, end)
+    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "frameon": False}
+    axes.legend(ncols=columns, fontsize=points, **place)
+    now = axes.axvline(begin, color=GHOST, linewidth=1)
+    veil = axes.axvspan(begin, end, color=PAPER, alpha=VEIL, linewidth=0, zorder=5)
+
+    def step(frame: int) -> None:
+        reached = min(float(shots.seconds[frame]), end)
+        now.set_xdata([reached, reached])
+        veil.set_bounds(reached, 0, end - reached, 1)
+
+    return step

@@ -1,0 +1,292 @@
+"""Solid bodies: the MJCF model of a body drawn twice by MuJoCo, in a worker process.
+
+OpenGL is bound to one backend for the life of a process and may end the process. The caller's
+environment and its MuJoCo stay unchanged.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pebble import ProcessExpired, ProcessPool
+
+from retwin.cases.animation.shots import (
+    GHOST,
+    PAPER,
+    RING,
+    SOLID,
+    UPDATED,
+    Pictures,
+    Shots,
+    rings,
+)
+from retwin.checks import require
+from retwin.errors import InputError, brief
+from retwin.processes import worker_pool
+
+if TYPE_CHECKING:
+    from retwin.cases.case import Body
+
+BACKENDS = ("egl", "osmesa")
+"""Backends that draw without a screen, tried in this order unless MUJOCO_GL names one."""
+FRAMES_PER_TASK = 10
+"""Number of frames per task: enough to hide the transfer, few enough to show progress."""
+TIMEOUT = 120.0
+"""Duration in s after which a task is ended as hung; software rendering is slow."""
+BROKEN = (RuntimeError, ProcessExpired, TimeoutError)
+"""Errors of a worker that cannot draw."""
+GHOST_OPACITY = 0.6
+"""Opacity of the ghost, from 0 to 1."""
+FLOOR, BODY, HIDDEN = 0, 1, 5
+"""MuJoCo's groups of geometry, which can be shown separately."""
+
+
+@contextmanager
+def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator[Pictures]:
+    """Draw pictures in a worker process that lives as long as the block.
+
+    Parameters
+    ----------
+    shots : Shots
+        The frames.
+    body : Body
+        A body with a model.
+    size : (int, int)
+        Width and height in pixels.
+
+    Yields
+    ------
+    iterable of ndarray of uint8, shape (height, width, 3)
+        One picture per frame.
+
+    Raises
+    ------
+    InputError
+        The body has no model, the model lacks a joint, a package is missing, or no backend works.
+
+    """
+    require(
+        body.model is not None,
+        "renderer",
+        expected="a body with a model",
+        got="a body that is a chain of points only",
+        remedy="draw it as a stick figure",
+    )
+    require(
+        importlib.util.find_spec("OpenGL") is not None,
+        "renderer",
+        expected="the package pyopengl, which draws solid bodies",
+        got="an installation without it",
+        remedy='install it: pip install "retwin[render]"',
+    )
+    stage = _Stage(str(body.model), body.joints, tuple(shots.root.tolist()), shots.reach, size)
+    named = os.environ.get("MUJOCO_GL", "").lower()
+    reasons = []
+    for backend in (named,) if named else BACKENDS:
+        with ExitStack() as stack:
+            pool = stack.enter_context(worker_pool(1, _draw_with, (backend,)))
+            pictures = _pictures(pool, stage, shots)
+            try:
+                first = next(pictures)
+            except BROKEN as error:
+                hung = isinstance(error, TimeoutError)
+                why = f"it hung for more than {TIMEOUT:g} s" if hung else brief(error)
+                reasons.append(f"{backend}: {why}")
+                continue
+            with stack.pop_all():
+                yield (each for group in ((first,), pictures) for each in group)
+                return
+    raise InputError(
+        "renderer",
+        expected="OpenGL that draws without a screen",
+        got=f"none that works ({'; '.join(reasons)})",
+        remedy="install EGL or OSMesa (Debian: apt install libegl1 libgl1-mesa-dri, or libosmesa6)",
+    )
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """Settings of a scene: the MJCF file, joints, base of the chain in m, reach in m, and size."""
+
+    model: str
+    joints: tuple[str, ...]
+    root: tuple[float, ...]
+    reach: float
+    size: tuple[int, int]
+
+
+def _pictures(pool: ProcessPool, stage: _Stage, shots: Shots) -> Iterator[NDArray]:
+    """The pictures, some frames at a time, each with the traces that lead to it."""
+    for first in range(0, len(shots), FRAMES_PER_TASK):
+        end = min(first + FRAMES_PER_TASK, len(shots))
+        joints = np.stack([shots.nominal[first:end], shots.observed[first:end]])
+        tips = np.stack([shots.nominal_points[:end, -1], shots.observed_points[:end, -1]])
+        trails = [shots.trails(frame) for frame in range(first, end)]
+        yield from pool.schedule(_draw, (stage, joints, tips, trails), timeout=TIMEOUT).result()
+
+
+def _draw_with(backend: str) -> None:
+    """Set the backend in the worker, before the import of MuJoCo, which reads it."""
+    # A backend that does not work raises an error; a library's own warnings would repeat it.
+    warnings.simplefilter("ignore")
+    os.environ["MUJOCO_GL"] = backend
+    os.environ.pop("PYOPENGL_PLATFORM", None)
+
+
+def _draw(stage: _Stage, joints: NDArray, tips: NDArray, trails: Sequence[NDArray]) -> NDArray:
+    """Pictures (frames, height, width, 3) for joints (2, frames, joints), nominal and observed.
+
+    Runs in the worker. `tips` (2, all frames so far, 3) and the `trails` (draws, points, 3) of each
+    frame are in m. Failures are raised as RuntimeError, because OpenGL's errors cannot be sent to
+    another process.
+    """
+    try:
+        scene, before = _scene(stage), tips.shape[1] - joints.shape[1]
+        return np.stack(
+            [
+                scene.picture(joints[:, i], tips[:, : before + i + 1], trails[i])
+                for i in range(joints.shape[1])
+            ]
+        )
+    except InputError:
+        raise
+    except Exception as error:
+        raise RuntimeError(f"{type(error).__name__}: {error}") from None
+
+
+@lru_cache(maxsize=1)
+def _scene(stage: _Stage) -> _Scene:
+    """The scene, which a worker keeps between its tasks."""
+    return _Scene(stage)
+
+
+class _Scene:
+    """The model and its renderer; InputError if it lacks a joint."""
+
+    def __init__(self, stage: _Stage) -> None:
+        import mujoco
+
+        self._mujoco, self._stage = mujoco, stage
+        try:
+            self._model = _compiled(stage)
+            self._addresses = [self._model.joint(name).qposadr[0] for name in stage.joints]
+        except (ValueError, KeyError) as error:
+            raise InputError(
+                "model",
+                expected=f"an MJCF file with the joints {', '.join(stage.joints)}",
+                got=f"{stage.model} ({brief(error)})",
+                remedy="make the body's model and its joints agree",
+            ) from None
+        self._data = mujoco.MjData(self._model)
+        width, height = stage.size
+        self._renderer = mujoco.Renderer(self._model, height, width)
+        self._option = mujoco.MjvOption()
+        self._option.sitegroup[:] = 0
+        self._camera = mujoco.MjvCamera()
+        self._camera.lookat = np.add(stage.root, (0, 0, 0.38 * stage.reach))
+        self._camera.distance = 2.75 * stage.reach * max(1.0, 4 / 3 * height / width)
+        self._camera.azimuth, self._camera.elevation = 130, -18
+        own = self._model.geom_group == BODY
+        self._solid = self._model.geom_rgba.copy(), self._model.geom_matid.copy()
+        self._ghost = self._solid[0].copy(), np.where(own, -1, self._solid[1])
+        self._ghost[0][own, :3] = GHOST
+        mujoco.mj_forward(self._model, self._data)
+        self._background = self._rendered()
+
+    def picture(self, joints: NDArray, tips: NDArray, trails: NDArray) -> NDArray:
+        """The picture (height, width, 3) of nominal and observed joints (2, joints) in rad or m.
+
+        `tips` (2, points, 3) are traces of the nominal and the observed tip in m, and `trails`
+        (draws, points, 3) those of an updated twin, each of which ends in a ball.
+        """
+        nominal, observed = joints
+        solid = self._rendered(observed, self._solid, tuple(tips), trails)
+        # The ghost is behind the solid body: two surfaces in one place would flicker.
+        ghost = self._rendered(nominal, self._ghost)
+        free = (solid == self._background).all(axis=2)
+        seen = (ghost != self._background).any(axis=2) & free
+        background = self._background[seen]
+        solid[seen] = (1 - GHOST_OPACITY) * background + GHOST_OPACITY * ghost[seen]
+        return solid
+
+    def _rendered(
+        self,
+        joints: NDArray | None = None,
+        look: tuple[NDArray, NDArray] | None = None,
+        tips: Sequence[NDArray] = (),
+        trails: Sequence[NDArray] | NDArray = (),
+    ) -> NDArray:
+        """The picture of the floor, the body in a pose, and traces."""
+        self._option.geomgroup[BODY] = joints is not None
+        if joints is not None and look is not None:
+            self._data.qpos[self._addresses] = joints
+            self._model.geom_rgba[:], self._model.geom_matid[:] = look
+            self._mujoco.mj_kinematics(self._model, self._data)
+        self._renderer.update_scene(self._data, self._camera, self._option)
+        self._renderer.scene.flags[self._mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        for ring in rings(np.array(self._stage.root), self._stage.reach):
+            self._line(ring, RING, 1.5)
+        for trace, colour in zip(tips, (GHOST, SOLID), strict=False):
+            self._line(trace, colour, 3.0, ball=0.018)
+        for trail in trails:
+            self._line(trail, UPDATED, 1.0, ball=0.010)
+        return self._renderer.render()
+
+    def _line(
+        self, points: NDArray, colour: Sequence[float], width: float, ball: float = 0.0
+    ) -> None:
+        """Draw a line that may end in a ball.
+
+        `width` is in pixels of a picture 480 high, the ball's radius a share of the reach.
+        """
+        scene, kinds = self._renderer.scene, self._mujoco.mjtGeom
+        # A scene holds few objects: of long traces only every second or third point is drawn.
+        kept = points[:: 1 + len(points) // (scene.maxgeom // 4)]
+        for begin, end in pairwise(kept):
+            geom = self._added(kinds.mjGEOM_LINE, colour, np.zeros(3), np.zeros(3))
+            pixels = width * min(self._stage.size) / 480
+            self._mujoco.mjv_connector(geom, kinds.mjGEOM_LINE, pixels, begin, end)
+        if ball:
+            size = np.full(3, ball * self._stage.reach)
+            self._added(kinds.mjGEOM_SPHERE, colour, size, points[-1])
+
+    def _added(self, kind: Any, colour: Sequence[float], size: NDArray, place: NDArray) -> Any:
+        """A new object in the scene."""
+        scene = self._renderer.scene
+        geom = scene.geoms[scene.ngeom]
+        paint = np.array([*colour, 1], np.float32)
+        self._mujoco.mjv_initGeom(geom, kind, size, place, np.eye(3).ravel(), paint)
+        scene.ngeom += 1
+        return geom
+
+
+def _compiled(stage: _Stage) -> Any:
+    """The model on light paper, with what stands still in the group of the floor."""
+    import mujoco
+
+    spec = mujoco.MjSpec.from_file(stage.model)
+    for geom in spec.geoms:
+        # By convention groups above 2 are not shown: shapes for contact, for instance.
+        moves = geom.parent != spec.worldbody
+        geom.group = (BODY if geom.group <= 2 else HIDDEN) if moves else FLOOR
+    visual = spec.visual
+    visual.global_.offwidth, visual.global_.offheight = stage.size
+    visual.headlight.ambient, visual.headlight.diffuse = [0.5] * 3, [0.4] * 3
+    visual.headlight.specular = [0.1] * 3
+    spec.worldbody.add_light(pos=[0.4, -0.6, 1.5], dir=[-0.25, 0.35, -1], diffuse=[0.35] * 3)
+    for texture in spec.textures:
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            spec.delete(texture)
+    flat = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT}
+    spec.add_texture(name="retwin_paper", **flat, rgb1=PAPER, rgb2=PAPER, width=8, height=48)
+    return spec.compile()
