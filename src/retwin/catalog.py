@@ -350,7 +350,11 @@ SOURCES: Mapping[str, SourceEntry] = {
         "Updated twin (dynamics)", "healthy", (_DYNAMICS,), twin=_BY + "corrected_dynamics"
     ),
     "fit": SourceEntry(
-        "Updated twin (chosen by its calibration)", "healthy", twin=_BY + "chosen", simulates=True
+        "Updated twin (chosen by its calibration)",
+        "healthy",
+        (("update", "fit"),),
+        twin=_BY + "chosen",
+        simulates=True,
     ),
     **{
         name: SourceEntry(

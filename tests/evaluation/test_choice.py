@@ -161,12 +161,18 @@ def test_a_saved_model_predicts_the_same(tmp_path: Path, method: str) -> None:
         np.testing.assert_allclose(one.deviation, other.deviation, rtol=1e-6)
 
 
-def test_a_twin_that_cannot_be_opened_again_is_not_saved(tmp_path: Path) -> None:
+def test_a_twin_without_equations_and_case_is_given_when_it_is_loaded(tmp_path: Path) -> None:
     twin = rt.FunctionTwin(lambda u: np.cumsum(u, axis=1) * 0.1, INPUTS, OUTPUTS, 1.0)
     found = rt.fit(twin, records(0, slope=right), rt.Choice(candidates=("none",)))
-    with pytest.raises(rt.InputError, match=r"case.*can be opened again"):
-        found.save(tmp_path / "model")
-    assert not (tmp_path / "model").exists()
+    found.save(tmp_path / "model")
+    with pytest.raises(rt.InputError, match=r"the twin of this model.*load_twin\(folder, twin\)"):
+        rt.load_twin(tmp_path / "model")
+    again = rt.load_twin(tmp_path / "model", twin)
+    commands = records(1, slope=right).commands
+    for one, other in zip(
+        free_moments(again, commands), free_moments(found.twin, commands), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_without_a_comparison_the_method_is_fitted_to_all_records(tmp_path: Path) -> None:

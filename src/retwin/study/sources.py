@@ -13,8 +13,6 @@ from retwin.cases.case import Case
 from retwin.catalog import EXTRAS, SOURCES, SourceEntry
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import DANN, FineTune, FittedDiagnoser, Rocket, fit_diagnoser, fit_inversion
-from retwin.evaluation.choice import Choice, fit
-from retwin.evaluation.choice.stand_in import Simulating, stand_in
 from retwin.study.plan import StudyPlan
 from retwin.study.trial import Trial
 from retwin.twins.noisy import NoisyTwin, residual_scale
@@ -23,7 +21,6 @@ from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics import DynamicsTwin, state_names
 from retwin.update.residual import ResidualModel, SequenceMixture
-from retwin.update.surrogate import Surrogate
 
 
 def recorded_twin(trial: Trial) -> FittedDiagnoser:
@@ -71,12 +68,7 @@ def corrected_dynamics(trial: Trial) -> Twin:
 
 def chosen(trial: Trial) -> Twin:
     """The twin with the correction that predicts left-out parts of the calibration set best."""
-    case, seed = trial.case, trial.seed("update")
-    how = Simulating("auto", case.sampler, case.per_class, case.network, case.training)
-    twin = case.parametric or case.twin
-    base = stand_in(twin, trial.healthy, how, seed=seed, progress=trial.progress).twin
-    original = twin if isinstance(base, Surrogate) else None
-    return fit(base, trial.healthy, Choice.of(case), seed=seed, original=original).twin
+    return trial.updated("fit")
 
 
 def black_box(trial: Trial) -> Twin:

@@ -24,6 +24,7 @@ from retwin.update.corrected import CorrectedTwin, generate
 from retwin.update.corrections import Correction
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.identification import PosteriorTwin
+from retwin.update.loading import load_twin
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 
@@ -96,6 +97,8 @@ class Trial:
         A black-box model takes its place: an LSTM, or one of state equations.
         """
         folder = self._made("update", method)
+        if method == "fit":
+            return load_twin(folder, self.case.parametric or self.case.twin)
         if method == "lstm":
             return CorrectedTwin.load(folder)
         if method == "dynamics" or method in BLACK_BOXES:

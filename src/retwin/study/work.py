@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.cases.case import Case
-from retwin.catalog import NEEDS, SOURCES, resolve
+from retwin.catalog import CANDIDATES, NEEDS, SOURCES, resolve
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis import FittedDiagnoser
+from retwin.evaluation.choice import Choice, fit
 from retwin.evaluation.choice.stand_in import Simulating, stand_in
 from retwin.evaluation.diagnosers import finite_probabilities
 from retwin.evaluation.fidelity import (
@@ -242,14 +243,18 @@ class Work:
             fitted = fit_black_box(trial.healthy, trial.job.name, seed=seed, progress=progress)
             fitted.twin.save(path)
             return {}
-        if trial.job.name == "dynamics":
-            how = Simulating(
-                sampler=self.case.sampler,
-                equations=self.case.state_surrogate,
-            )
-            twin = self.case.parametric or self.case.twin
-            seed, progress = trial.seed("update"), trial.progress
+        if trial.job.name in ("dynamics", "fit"):
+            case, seed, progress = self.case, trial.seed("update"), trial.progress
+            equations = case.state_surrogate if trial.job.name == "dynamics" else None
+            simulated = case.sampler, case.per_class, case.network, case.training
+            how = Simulating("auto", *simulated, equations=equations)
+            twin = case.parametric or case.twin
             base = stand_in(twin, trial.healthy, how, seed=seed, progress=progress).twin
+            if trial.job.name == "fit":
+                settings, original = Choice.of(case), twin if isinstance(base, Surrogate) else None
+                found = fit(base, trial.healthy, settings, seed=seed, original=original)
+                found.twin.save(path)
+                return {"notes": f"chosen: {CANDIDATES[found.chosen]}"}
             made = fit_dynamics(
                 base,  # type: ignore[arg-type]  # it has state equations
                 trial.healthy,
@@ -310,7 +315,8 @@ class Work:
         twin = make(trial)
         rivals: dict[str, Twin] = {}
         widening = None
-        if isinstance(twin, CorrectedTwin) and twin.random:
+        corrected = any(kind == "residual" for kind, _ in SOURCES[trial.job.name].needs)
+        if corrected and isinstance(twin, CorrectedTwin) and twin.random:
             rivals, widening = self._rivals(trial, twin), self._widening(trial)
         found = measure_fidelity(
             twin,

@@ -152,14 +152,14 @@ class CorrectedTwin:
             self.residual.save(inside / "residual")
 
     @classmethod
-    def load(cls, folder: str | Path) -> CorrectedTwin:
-        """Read what `save` wrote.
+    def load(cls, folder: str | Path, twin: Twin | None = None) -> CorrectedTwin:
+        """Read what `save` wrote; `twin` is the one that it corrects, see `load_twin`.
 
         Raises InputError if the folder holds no corrected twin or is damaged.
         """
         about = read_about(folder, "corrected")
         folder = Path(folder)
-        surrogate = load_surrogate(folder / "surrogate")
+        surrogate = load_surrogate(folder / "surrogate", twin)
         residual = load_residual(folder / "residual")
         with refusing(folder, expected="a corrected twin"):
             forecast = ForecastErrors.of(about.get("forecast"))

@@ -86,11 +86,7 @@ class ExactSurrogate(OfTwin):
     def save(self, folder: str | Path, case: str = "") -> None:
         """Write the twin: its equations, or the name of the case whose twin it is, and its values.
 
-        Raises
-        ------
-        InputError
-            A twin that is neither a `StateTwin` nor that of a case.
-
+        Of a twin that has neither equations nor a case, `load` must be given the twin.
         """
         if isinstance(self.twin, DynamicsTwin):
             self.twin.save(folder)
@@ -99,13 +95,6 @@ class ExactSurrogate(OfTwin):
         if state_names(self.twin):
             about["equations"] = equations_of(with_present_values(self.twin))  # type: ignore[arg-type]
         else:
-            require(
-                case,
-                "case",
-                expected="the name of a case, whose twin can be opened again",
-                got=f"none, for a {type(self.twin).__name__}",
-                remedy="give the name of a case.toml; StateTwin and surrogates need none",
-            )
             about["case"] = case
             if isinstance(self.twin, ParametricTwin):
                 about["values"] = dict(zip(self.twin.names, self.twin.values, strict=True))
@@ -113,10 +102,11 @@ class ExactSurrogate(OfTwin):
             pass
 
     @classmethod
-    def load(cls, folder: str | Path) -> ExactSurrogate:
+    def load(cls, folder: str | Path, twin: Twin | None = None) -> ExactSurrogate:
         """Read what `save` wrote; the twin of a case is opened, which may run the user's code.
 
-        Raises InputError if the folder holds no twin, is damaged, or its case is not there.
+        `twin` takes the place of the case's. Raises InputError if the folder holds no twin, is
+        damaged, its case is not there, or it has none and no twin is given.
         """
         if kind_of(folder) == DynamicsTwin.kind:
             return cls(DynamicsTwin.load(folder), differences=False)
@@ -124,21 +114,30 @@ class ExactSurrogate(OfTwin):
         if "equations" in about:
             with refusing(folder, expected="the equations of a twin"):
                 return cls(equations_from(StateTwin, about["equations"]), differences=False)
-        system = catalog.resolve(catalog.OPENED_CASE)(about["case"])
-        values = about.get("values")
+        values, name = about.get("values"), about["case"]
+        if twin is None:
+            require(
+                name,
+                "twin",
+                expected="the twin of this model, which has neither equations nor a case",
+                got="none",
+                remedy="give it in Python, load_twin(folder, twin), or fit a case.toml",
+            )
+            system = catalog.resolve(catalog.OPENED_CASE)(name)
+            twin = system.twin if values is None else system.parametric
         if values is None:
-            return cls(system.twin, differences=False)
-        parametric = require_parameters(system.parametric, about["case"])
-        return cls(parametric.with_values(values), differences=False)
+            return cls(twin, differences=False)
+        own = twin if isinstance(twin, ParametricTwin) else None
+        return cls(require_parameters(own, name).with_values(values), differences=False)
 
 
-def load_surrogate(folder: str | Path) -> Surrogate:
+def load_surrogate(folder: str | Path, twin: Twin | None = None) -> Surrogate:
     """The surrogate in a folder, or the twin that was saved in place of one.
 
     Raises InputError as `Surrogate.load` and `ExactSurrogate.load` do.
     """
     if kind_of(folder) in (KIND, DynamicsTwin.kind):
-        return ExactSurrogate.load(folder)  # type: ignore[return-value]  # it has what is used
+        return ExactSurrogate.load(folder, twin)  # type: ignore[return-value]  # it has what is used
     return Surrogate.load(folder)
 
 

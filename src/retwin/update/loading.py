@@ -9,6 +9,7 @@ from retwin.errors import InputError
 from retwin.serialisation.models import kind_of
 
 if TYPE_CHECKING:
+    from retwin.twins.twin import Twin
     from retwin.update.corrected import CorrectedTwin
     from retwin.update.dynamics import DynamicsTwin
 
@@ -16,13 +17,16 @@ IDENTIFICATION = "identification.json"
 """A file in the folder of an identification."""
 
 
-def load_twin(folder: str | Path) -> CorrectedTwin | DynamicsTwin:
+def load_twin(folder: str | Path, twin: Twin | None = None) -> CorrectedTwin | DynamicsTwin:
     """The updated twin that `rt.fit`, `retwin fit` or the method `save` of a twin wrote.
 
     Parameters
     ----------
     folder : path
         The folder of the model.
+    twin : Twin, optional
+        The twin that it corrects, with its parameters free if they were identified. Only a model of
+        a twin needs it that has neither equations nor a surrogate nor a case, such as a function.
 
     Returns
     -------
@@ -52,4 +56,6 @@ def load_twin(folder: str | Path) -> CorrectedTwin | DynamicsTwin:
             got=got,
             remedy=remedy,
         )
-    return (DynamicsTwin if kind == DynamicsTwin.kind else CorrectedTwin).load(folder)
+    if kind == DynamicsTwin.kind:
+        return DynamicsTwin.load(folder)
+    return CorrectedTwin.load(folder, twin)
