@@ -101,6 +101,37 @@ def test_dynamics_are_compared_at_a_horizon() -> None:
 
 
 @pytest.mark.slow
+def test_an_unstable_twin_is_judged_over_a_shorter_time_which_is_stated() -> None:
+    """A heater whose loss is negative, in closed loop: free simulation grows by e every 10 s."""
+    rng, heat, pairs = np.random.default_rng(0), 0.0, []
+    for k in range(600):
+        power = 1.0 + np.sin(0.1 * k) - 2.0 * heat + 0.3 * rng.normal()
+        pairs.append((power, heat + 0.01 * rng.normal()))
+        for _ in range(10):
+            heat += 0.1 * (0.3 * power + 0.1 * heat)
+    power, heat = (each[None, :, None] for each in np.array(pairs).T)
+    data = rt.Trajectories(power, 0 * heat, heat, 1.0, inputs=INPUTS, outputs=OUTPUTS)
+    twin = StateTwin(
+        (State("heat", "K", 0.0),),
+        lambda x, u, p: x.heat,
+        INPUTS,
+        OUTPUTS,
+        1.0,
+        derivative=lambda x, u, p: (p.gain * u.power + p.growth * x.heat,),
+        parameters=[
+            rt.Parameter("gain", "K/J", 0.01, 2.0, 0.2),
+            rt.Parameter("growth", "1/s", 0.0, 0.5, 0.05),
+        ],
+    )
+    found = rt.fit(twin, data, rt.Choice(candidates=FAST))
+    assert found.horizon is not None
+    assert found.horizon < 60
+    assert "unstable" in found.remarks[0]
+    # Its filter does not follow the machine for so long, and that is stated too.
+    assert found.score(found.chosen).rmse["heat"] < heat.std() or "Do not use" in found.remarks[1]
+
+
+@pytest.mark.slow
 def test_bands_hold_what_they_promise_of_other_records() -> None:
     """Over records that were not used, at each time ahead; errors are those of 1200 samples."""
     found = rt.fit(twin_of(), records(0, 1, slope=radiating), rt.Choice(candidates=FAST))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import copy
 import time
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,17 +15,16 @@ from retwin.catalog import CANDIDATES
 from retwin.checks import require
 from retwin.data.measured import check_magnitude
 from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.errors import InputError
 from retwin.evaluation.choice.candidates import Candidates, Model
 from retwin.evaluation.choice.comparison import Comparison, Predicted, predict
 from retwin.evaluation.choice.fitted import CandidateScore, Fitted
-from retwin.evaluation.choice.folds import Fold, block_length, block_means, folds_of
+from retwin.evaluation.choice.folds import block_length, block_means, folds_of
 from retwin.evaluation.choice.remarks import remarks_of, without_twin
 from retwin.evaluation.choice.settings import Choice
+from retwin.evaluation.choice.trials import FAILURES, Trials, shorter, unstable
 from retwin.progress import Progress
 from retwin.scores.distributions import crps_normal
 from retwin.threads import one_thread
-from retwin.twins.collected import SimulationError
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Twin, check_channels
 from retwin.update.blackbox import BLACK_BOXES, fit_black_box
@@ -38,8 +36,12 @@ from retwin.update.forecast_errors import ForecastErrors
 from retwin.update.forecasts import LEADS, calibrate_forecasts, forecasts, free_moments
 from retwin.update.residual.fitting import calibrating
 
-FAILURES = (InputError, SimulationError, RuntimeError, ArithmeticError, np.linalg.LinAlgError)
-"""What ends a candidate, and not the comparison: refused records, diverging fits and trainings."""
+UNSTABLE = (
+    "Free simulation from the commands alone diverges, or is no better than the mean of the "
+    "outputs: the twin integrates, or is unstable. Candidates were judged {:.3g} s after the last "
+    "measurement instead. Use no free simulation of this model."
+)
+"""What is said where candidates were judged over a shorter time than was asked for."""
 
 
 @one_thread()  # fits are small, and threads that wait for each other take longer
@@ -104,20 +106,37 @@ def fit(
     folds = folds_of(records)
     trials = Trials(whole, folds, names, progress or (lambda _: None))
     trials.run()
-    comparison = trials.comparison
+    comparison, reasons = trials.compared(settings.horizon)
+    horizon = settings.horizon
+    if horizon is None and unstable(comparison, whole.updated):
+        horizon = shorter(whole)
+        comparison, reasons = trials.compared(horizon)
+    require(
+        comparison.predicted,
+        "twin",
+        expected="simulations that stay finite",
+        got="; ".join(reasons.values()),
+        remedy="identify the twin first, or judge it over a shorter horizon",
+    )
     preferred, differences = comparison.simplest()
     chosen = settings.method or preferred
     model = _calibrated(given or trials.final(chosen), trials, chosen, comparison)
-    scores = _scores(trials, comparison, differences)
+    scores = tuple(
+        _row(name, comparison, differences, trials.seconds[name], reasons.get(name, ""))
+        for name in trials.names
+    )
+    remarks = remarks_of(twin, records, comparison, scores, chosen, preferred, horizon)
+    if horizon != settings.horizon:
+        remarks = (UNSTABLE.format(horizon), *remarks)
     predicted, deviation = _shown(comparison, chosen)
     found = Fitted(
         twin=model,
         chosen=chosen,
         preferred=preferred,
         scores=scores,
-        remarks=remarks_of(twin, records, comparison, scores, chosen, preferred, settings.horizon),
+        remarks=remarks,
         parameters=_parameters(whole, model),
-        horizon=settings.horizon,
+        horizon=horizon,
         parts=tuple(each.name for each in folds),
         records=records,
         predicted=predicted,
@@ -175,86 +194,10 @@ def _names(candidates: Candidates, settings: Choice) -> list[str]:
     return names
 
 
-@dataclass(eq=False)
-class Trials:
-    """The fits of all candidates without each fold, and what they predict."""
-
-    whole: Candidates
-    folds: Sequence[Fold]
-    names: Sequence[str]
-    progress: Progress
-    models: dict[str, list[Model]] = field(default_factory=dict)
-    predicted: dict[str, list[Predicted]] = field(default_factory=dict)
-    reasons: dict[str, str] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def run(self) -> None:
-        """Fit and predict all."""
-        total, done = len(self.names) * len(self.folds) + len(self.names), 0
-        for fold in self.folds:
-            training = fold.training(self.whole.records)
-            own = replace(self.whole, records=training, settings=self.whole.settings.lighter)
-            fits = own.fits
-            for name in self.names:
-                if name not in self.reasons:
-                    self._try(name, fits.get(name), fold)
-                done += 1
-                self.progress(done / total)
-        require(
-            len(self.reasons) < len(self.names),
-            "records",
-            expected="records to which a candidate can be fitted without a part of them",
-            got="; ".join(f"{name}: {reason}" for name, reason in self.reasons.items()),
-            remedy="give longer or more records",
-        )
-
-    def _try(self, name: str, fit: Callable[[], Model] | None, fold: Fold) -> None:
-        began = time.process_time()
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the final fit states them
-                if fit is None:
-                    raise InputError("records", expected="such records", got="none", remedy="")
-                model = fit()
-                made = predict(model, self.whole.records, fold, self.whole.settings.horizon)
-        except FAILURES as error:
-            self.reasons[name] = str(error)
-            return
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.process_time() - began
-        if not np.isfinite(made.mean[np.isfinite(made.last)]).all():
-            self.reasons[name] = "its simulation is not finite"
-            return
-        self.models.setdefault(name, []).append(model)
-        self.predicted.setdefault(name, []).append(made)
-
-    @property
-    def comparison(self) -> Comparison:
-        """Of the candidates that could be fitted without any fold."""
-        kept = {name: made for name, made in self.predicted.items() if name not in self.reasons}
-        found = Comparison(self.whole.records, self.folds, kept)
-        for name in kept:
-            if found.diverged(name):
-                self.reasons[name] = "its simulation diverges"
-        good = {name: made for name, made in kept.items() if name not in self.reasons}
-        require(
-            good,
-            "twin",
-            expected="simulations that stay finite",
-            got="; ".join(self.reasons.values()),
-            remedy="identify the twin first, or judge it over a horizon",
-        )
-        return Comparison(self.whole.records, self.folds, good)
-
-    def final(self, name: str) -> Model:
-        """The candidate, fitted to all records."""
-        return self.whole.fits[name]()
-
-
 def _calibrated(model: Model, trials: Trials, name: str, comparison: Comparison) -> Model:
     """The model with bands that hold what the parts in time show."""
     records, found = trials.whole.records, []
-    if name in trials.reasons:
+    if name not in comparison.predicted:
         return model
     leads = [each for each in LEADS if 4 * each <= records.steps]
     for one, fold in zip(trials.models[name], trials.folds, strict=True):
@@ -353,18 +296,6 @@ def _behind(found: Fitted, comparison: Comparison, kind: str) -> tuple[float, fl
     own = block_means(change, block_length(np.nan_to_num(change), seen))
     chance = own.std(ddof=1) / np.sqrt(len(own)) if len(own) > 1 else float("inf")
     return float(own.mean()), float(chance)
-
-
-def _scores(
-    trials: Trials,
-    comparison: Comparison,
-    differences: dict[str, tuple[float, float]],
-) -> tuple[CandidateScore, ...]:
-    """The rows of the table."""
-    return tuple(
-        _row(name, comparison, differences, trials.seconds[name], trials.reasons.get(name, ""))
-        for name in trials.names
-    )
 
 
 def _row(
