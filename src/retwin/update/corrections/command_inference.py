@@ -17,8 +17,8 @@ from torch import Tensor
 
 from retwin.checks import require
 from retwin.inference.em import expectation_maximisation
-from retwin.inference.hierarchy import Hierarchy
-from retwin.inference.noise import Noise
+from retwin.inference.hierarchy import Hierarchy, Likelihood
+from retwin.inference.noise import Noise, predicted_lagged, predicted_variance
 from retwin.inference.solver import Solution, blocks
 from retwin.threads import one_thread
 from retwin.update.corrections.command_problem import CommandProblem
@@ -39,9 +39,6 @@ MAX_ROUNDS = 12
 """Rounds of expectation-maximisation at most, with a search for missed segments in each."""
 TOLERANCE = 0.02
 """Relative change of all standard deviations below which they have converged."""
-DELAY_VARIANCE = 1 / 12
-"""Variance of the delays that the hyperprior expects, in samples squared: that of the time of an
-event within a sample."""
 SUSPECT = 2.5
 """Standard deviations of the prior beyond which an offset makes a segment suspect."""
 MOVING = 3.0
@@ -56,8 +53,6 @@ FIRST_ODDS = -4.0
 """Log odds at first that an actuator misses a segment: about one in fifty."""
 FIRST_JITTER = 1 / 35
 """Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
-SMALLEST_SHARE = 0.1
-"""Smallest share of the samples that is taken to be left after z* has been fitted to them."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -240,34 +235,34 @@ class Hyperparameters:
 
     def learned(self, problem: CommandProblem, solution: Solution) -> Hyperparameters:
         """The most probable hyperparameters, given what was inferred and how certain that is."""
-        white, x = self.whitened(problem), solution.x
+        white, x, design = self.whitened(problem), solution.x, self.features.design(problem)
         samples = self.samples.learned(white, self.noise, x)
         white = replace(white, whitening=samples.whitening())
-        # Offsets are expected to be a share of what the actuators travel, the same for all.
-        spread, variance = self.features.spread.square(), self.hierarchy.variance
-        share, delay = (variance[1:-1] / spread).mean(), variance.new_tensor([DELAY_VARIANCE])
-        expected = torch.cat([delay, share * spread, delay])
         return Hyperparameters(
             self.features,
-            self.hierarchy.learned(self.features.design(problem), solution, expected),
+            self.hierarchy.learned(design, Likelihood.of(solution, self.hierarchy.prior(design))),
             _odds(problem),
             samples,
             self._noise(white, solution),
         )
 
     def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
-        """The noise of residuals, of which z* has fitted a part: few samples seem too exact."""
-        learned = white.learned_noise(self.noise, white.residual(solution.x), floor=FLOOR)
-        open_ = (self.prior(white).gaussian.precision * solution.covariance).sum()
-        fitted = solution.x.numel() - open_  # components of x that the outputs determine
-        count = white.measured.sum() * white.observed.shape[2]
-        left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
-        return replace(learned, scale=learned.scale / left.sqrt())
+        """The noise of residuals, to a part of which z* has been fitted."""
+        design = self.features.design(white)
+        likelihood = Likelihood.of(solution, self.hierarchy.prior(design))
+        residual, jacobian = white.linearised(solution.x)
+        covariance = self.hierarchy.posterior_covariance(design, likelihood)
+        variance = predicted_variance(jacobian, covariance)
+        lagged = predicted_lagged(jacobian, covariance)
+        learned = white.learned_noise(self.noise, residual, variance, lagged, FLOOR)
+        weights = self.noise.weights(white, residual)[..., None].sqrt()
+        repeated = self.features.repeated(white, weights * residual)
+        return replace(learned, thinning=learned.thinning * repeated)
 
     def near(self, other: Hyperparameters) -> bool:
         """Whether all standard deviations are about those of `other`."""
         pairs = (
-            (self.hierarchy.variance.sqrt(), other.hierarchy.variance.sqrt()),
+            (self.hierarchy.total().sqrt(), other.hierarchy.total().sqrt()),
             (self.noise.scale, other.noise.scale),
         )
         return all(bool(((a / b).log().abs() < TOLERANCE).all()) for a, b in pairs)
@@ -286,12 +281,13 @@ def _discrepancy(
     design = hyperparameters.features.design(problem)
     prior = hyperparameters.prior(problem).gaussian
     common = _common(problem)
+    found, covariance = hierarchy.integrated(design, Likelihood.of(solution, prior))
     x, mean = (
-        (common @ problem.per_segment(each)[..., None])[..., 0] for each in (solution.x, prior.mean)
+        (common @ problem.per_segment(each)[..., None])[..., 0] for each in (found, prior.mean)
     )
     inner, wide = (
         common @ blocks(each, segments) @ common.mT
-        for each in (hierarchy.posterior_covariance(design, solution), prior.covariance)
+        for each in (covariance, prior.covariance)
     )
     left, wide = inner.diagonal(dim1=-2, dim2=-1), wide.diagonal(dim1=-2, dim2=-1)
     severity = torch.where(problem.faulty, (x - mean)[..., 1:], 0.0)
@@ -303,7 +299,7 @@ def _discrepancy(
     bounded = at_bound(delay, problem.delay_range) & problem.valid
     known[..., 0] &= ~bounded
     known[..., 1:] &= missed < 0.5
-    own = torch.cat([wide[..., :1], hierarchy.variance[1:-1].expand_as(severity)], dim=-1)
+    own = torch.cat([wide[..., :1], hierarchy.total()[1:-1].expand_as(severity)], dim=-1)
     inner = inner * learned[..., None] * learned[..., None, :]
     inner = inner + torch.diag_embed(own * (1 - learned))
     covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))

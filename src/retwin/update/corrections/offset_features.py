@@ -1,13 +1,18 @@
-"""What an actuator's offset may depend on: a constant, the direction and distance, the pose."""
+"""What errors of actuators may depend on: a constant, direction and distance, pose, condition.
+
+A condition is a segment with certain commands of all actuators, before and after it. Its replicates
+have an effect in common that no regression need explain.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from retwin.inference.hierarchy import Design
+from retwin.inference.hierarchy import CONDITION, Design
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import STILL
 
@@ -16,6 +21,16 @@ OWN_FEATURES = 3
 MAX_COEFFICIENTS = 500
 """Largest number of coefficients in all with which offsets depend on the targets of all actuators;
 with more actuators, each offset depends on its own actuator's target only."""
+MAX_EFFECTS = 1000
+"""Largest number of effects of conditions; of more conditions the last ones have none."""
+EQUAL = 0.01
+"""Distance, in the spread of the targets, below which commands are equal."""
+DELAY_DEVIATION = math.sqrt(1 / 12)
+"""Standard deviation of the delays that the hyperprior expects, in samples: that of the time of an
+event within a sample."""
+SMALL = 0.01
+"""Expected variance of a regression's coefficients, relative to that of offsets: small unless data
+say more. A constant is expected to be as large as offsets are."""
 WIDE = 30.0
 """Standard deviation of the prior, in that of a healthy offset, where a fault may be anything."""
 
@@ -30,12 +45,18 @@ class OffsetFeatures:
         (d_u,), mean and standard deviation of the targets.
     travel : Tensor
         (d_u,), root mean square of the distance from target to target.
+    replicated : Tensor
+        (C, 2 d_u), the conditions that are there more than once, see `conditions`.
+    regression : bool
+        Whether the mean of an offset depends on direction, distance and pose.
 
     """
 
     centre: Tensor
     spread: Tensor
     travel: Tensor
+    replicated: Tensor
+    regression: bool = False
 
     @classmethod
     def of(cls, problem: CommandProblem) -> OffsetFeatures:
@@ -50,19 +71,33 @@ class OffsetFeatures:
         )
         smallest = STILL * problem.reference.abs().amax(dim=(0, 1))
         travel = torch.where(travel <= smallest, 1.0, travel)
-        return cls(centre, torch.where(spread <= smallest, travel, spread), travel)
+        spread = torch.where(spread <= smallest, travel, spread)
+        found = cls(centre, spread, travel, centre.new_zeros(0, 2 * len(centre)))
+        every, counts = found.conditions(problem)[problem.valid].unique(dim=0, return_counts=True)
+        return replace(found, replicated=every[counts > 1][: MAX_EFFECTS // problem.size])
+
+    def conditions(self, problem: CommandProblem) -> Tensor:
+        """(n, M, 2 d_u), commands before and after each segment, in multiples of what is equal."""
+        first, last = (
+            ((each - self.centre) / (EQUAL * self.spread)).round() for each in problem.levels
+        )
+        return torch.cat([first, last], dim=-1)
 
     def design(self, problem: CommandProblem) -> Design:
-        """The regression of x on a common delay, and on the features of the offsets.
+        """The regression of x on a common delay, features of the offsets, and conditions.
 
         Group 0 holds the common delays, group 1 + u the offsets of actuator u, and the last group
         the differences of the actuators' own delays from the common one.
         """
         n, segments, width = problem.missed.shape
         own = self._features(problem)
-        count = own.shape[-1]
-        features = own.new_zeros(n, segments, problem.size, 1 + width * count)
+        count, base = own.shape[-1], 1 + width * own.shape[-1]
+        match = self._match(problem).to(own)
+        effects = len(self.replicated) * problem.size
+        features = own.new_zeros(n, segments, problem.size, base + effects)
         features[:, :, 0, 0] = 1.0
+        identity = torch.eye(problem.size, dtype=own.dtype)
+        features[..., base:] = torch.einsum("nmc,pq->nmpcq", match, identity).flatten(3)
         for u in range(width):
             features[:, :, 1 + u, 1 + u * count : 1 + (u + 1) * count] = own[:, :, u]
         # Where a fault bends the reference, nothing is known of its severity.
@@ -78,14 +113,62 @@ class OffsetFeatures:
         actuators = torch.arange(1, 1 + width)
         zero, last = torch.tensor([0]), torch.tensor([1 + width])
         group = torch.cat([zero, actuators, last.expand(problem.size - 1 - width)])
+        delay = own.new_tensor([DELAY_DEVIATION])
+        single = (1 - match.sum(dim=-1)) * float(len(self.replicated) > 0)
+        kinds = torch.arange(1, 1 + count).repeat(width)
+        share = own.new_tensor([1.0, 1.0, *[SMALL] * (count - 1)])
         return Design(
             features.flatten(1, 2),
             group=group.repeat(segments),
             wider=wider.flatten(1),
             used=used.flatten(1),
-            owner=torch.cat([zero, actuators.repeat_interleave(count)]),
-            kind=torch.cat([zero, torch.arange(1, 1 + count).repeat(width)]),
+            owner=torch.cat(
+                [zero, actuators.repeat_interleave(count), group.repeat(len(self.replicated))]
+            ),
+            kind=torch.cat([zero, kinds, torch.full((effects,), CONDITION)]),
+            single=single[..., None].expand_as(wider).flatten(1),
+            tied=(1, 1 + width),
+            unit=torch.cat([delay, self.spread, delay]),
+            share=share,
         )
+
+    def repeated(self, problem: CommandProblem, residual: Tensor) -> Tensor:
+        """Samples (G,) per independent one, as residuals (n, S, d_y) repeat in replicates.
+
+        Errors of the path are those of the commands, so that the same commands show them again.
+        """
+        factor = residual.new_ones(2)
+        row, sample = (problem.measured > 0).nonzero().unbind(dim=1)
+        segment = problem.inside[row, :, sample].argmax(dim=1)
+        match = self._match(problem)[row, segment] & (problem.inside[row, :, sample].any(dim=1))[:, None]
+        some = match.any(dim=1)
+        if not some.any():
+            return factor
+        row, sample, segment, match = row[some], sample[some], segment[some], match[some]
+        time = problem.sample[row, sample] - torch.as_tensor(problem.segments.start)[row, segment]
+        step = problem.sample.diff(dim=1)
+        step = step[step > 0].double().median()
+        cell = torch.stack([match.long().argmax(dim=1), (time / step).round().long()], dim=1)
+        _, cell = cell.unique(dim=0, return_inverse=True)
+        values, group = residual[row, sample], problem.group[row, sample]
+        for k in range(2):
+            own = cell[group == k]
+            if not len(own):
+                continue
+            zero = values.new_zeros(int(cell.max()) + 1)
+            count = zero.index_add(0, own, torch.ones_like(own, dtype=zero.dtype))
+            part = values[group == k]
+            sums = zero[:, None].repeat(1, part.shape[1]).index_add(0, own, part)
+            square = zero.index_add(0, own, part.square().sum(dim=1))
+            pairs = (sums.square().sum(dim=1) - square).sum()
+            correlation = (pairs / ((count - 1) * square).sum().clamp_min(1e-30)).clamp(0, 1)
+            factor[k] = 1 + correlation * (count.square().sum() / count.sum() - 1)
+        return factor
+
+    def _match(self, problem: CommandProblem) -> Tensor:
+        """(n, M, C) bool, whether a segment is a replicate of a condition."""
+        match = (self.conditions(problem)[:, :, None] == self.replicated).all(dim=-1)
+        return match & problem.valid[..., None]
 
     def _direction(self, problem: CommandProblem) -> Tensor:
         """Sign (n, M, d_u) of each actuator's motion, 0 where it stands still."""
@@ -98,6 +181,8 @@ class OffsetFeatures:
         first, last = problem.levels
         distance, width = last - first, last.shape[-1]
         direction = self._direction(problem)
+        if not self.regression:
+            return torch.ones_like(last)[..., None]
         own = torch.stack([torch.ones_like(last), direction, distance / self.travel], dim=-1)
         pose = (last - self.centre) / self.spread
         if width * (OWN_FEATURES + width) > MAX_COEFFICIENTS:
