@@ -102,7 +102,6 @@ class Noise:
         blocks: float,
         rounding: tuple[float, ...] = (),
         variance: Tensor | float = 0.0,
-        lagged: Tensor | None = None,
         floor: float = 1e-18,
     ) -> Noise:
         """The noise that makes residuals most probable: one step of maximisation.
@@ -125,9 +124,6 @@ class Noise:
             the part of it that noise does not average out is common to the block too.
         variance : Tensor | float
             (R, K, d), the posterior variance of the predicted outputs.
-        lagged : Tensor, optional
-            (R, K - 1, d), the posterior covariance of successive predicted outputs: what has been
-            fitted to correlated errors has taken most of their correlation.
         floor : float
             Smallest scale, in the residual's unit.
 
@@ -152,14 +148,7 @@ class Noise:
             variances = variances.clamp_min(lattice)
             scale.append((variances if len(self.scale[k]) > 1 else variances.mean(0, True)).sqrt())
             kept = residual / self.scale[k] * (weights * part).sqrt()
-            unseen = None
-            if lagged is not None:
-                weight = (weights * part).sqrt() / self.scale[k]
-                product = weight[:, 1:] * weight[:, :-1] * lagged
-                unseen = (weight[:, 1:].square() * variance[:, 1:], product)
-            time = correlation_time(
-                kept, part[..., 0], rows=False, limit=MAX_CORRELATION, unseen=unseen
-            )
+            time = correlation_time(kept, part[..., 0], rows=False, limit=MAX_CORRELATION)
             # Exact outputs have a scale of 0.
             share = (shared / scale[-1].square().mean().clamp_min(1e-300)).clamp_min(common)
             thinning.append(time + share * count / blocks)
@@ -195,14 +184,7 @@ def common_rounding(within: Tensor, rounding: float) -> Tensor:
     return within.new_tensor(np.interp(within.numpy(), left, common))
 
 
-def correlation_time(
-    values: Tensor,
-    counted: Tensor,
-    *,
-    rows: bool,
-    limit: float,
-    unseen: tuple[Tensor, Tensor] | None = None,
-) -> Tensor:
+def correlation_time(values: Tensor, counted: Tensor, *, rows: bool, limit: float) -> Tensor:
     """Samples per independent sample of a first-order autoregression.
 
     Parameters
@@ -215,31 +197,15 @@ def correlation_time(
         True for one number (R,) for each row, False for a single one () of all rows together.
     limit : float
         Largest autocorrelation, below 1.
-    unseen : tuple of Tensor, optional
-        (R, K - 1, d) each, the variance of all but the first values and their covariance with those
-        before, beyond what the values show.
 
     """
     dims = (1, 2) if rows else (0, 1, 2)
-    square, product = values[:, 1:].square(), values[:, 1:] * values[:, :-1]
-    if unseen is not None:
-        square, product = square + unseen[0], product + unseen[1]
-    power = (square * counted[:, :-1, None]).sum(dim=dims).clamp_min(1e-30)
-    correlation = (product.sum(dim=dims) / power).clamp(0, limit)
+    power = (values[:, 1:].square() * counted[:, :-1, None]).sum(dim=dims).clamp_min(1e-30)
+    correlation = ((values[:, 1:] * values[:, :-1]).sum(dim=dims) / power).clamp(0, limit)
     return (1 + correlation) / (1 - correlation)
 
 
 def predicted_variance(jacobian: Tensor, covariance: Tensor) -> Tensor:
     """Variance (R, K, d) of outputs with a Jacobian (R, K, d, P) by x of covariance (R, P, P)."""
-    return _predicted(jacobian, covariance, 0)
-
-
-def predicted_lagged(jacobian: Tensor, covariance: Tensor) -> Tensor:
-    """Covariance (R, K - 1, d) of successive outputs, see `predicted_variance`."""
-    return _predicted(jacobian, covariance, 1)
-
-
-def _predicted(jacobian: Tensor, covariance: Tensor, lag: int) -> Tensor:
-    """Covariance (R, K - lag, d) of outputs and those `lag` samples before."""
-    moved = (jacobian[:, lag:].flatten(1, 2) @ covariance).view_as(jacobian[:, lag:])
-    return (moved * jacobian[:, : jacobian.shape[1] - lag]).sum(dim=-1)
+    flat = jacobian.flatten(1, 2)
+    return ((flat @ covariance) * flat).sum(dim=-1).view(jacobian.shape[:3])

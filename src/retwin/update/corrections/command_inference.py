@@ -18,7 +18,7 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.inference.em import expectation_maximisation
 from retwin.inference.hierarchy import Hierarchy, Likelihood
-from retwin.inference.noise import Noise, predicted_lagged, predicted_variance
+from retwin.inference.noise import Noise
 from retwin.inference.solver import Solution, blocks
 from retwin.threads import one_thread
 from retwin.update.corrections.command_problem import CommandProblem
@@ -33,6 +33,7 @@ from retwin.update.corrections.missed_segments import (
     searched,
 )
 from retwin.update.corrections.offset_features import OffsetFeatures
+from retwin.update.corrections.path_error import contradiction
 from retwin.update.corrections.sample_noise import SampleNoise
 
 MAX_ROUNDS = 12
@@ -53,6 +54,8 @@ FIRST_ODDS = -4.0
 """Log odds at first that an actuator misses a segment: about one in fifty."""
 FIRST_JITTER = 1 / 35
 """Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
+SMALLEST_SHARE = 0.1
+"""Smallest share of the samples that is taken to be left after z* has been fitted to them."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -248,16 +251,25 @@ class Hyperparameters:
 
     def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
         """The noise of residuals, to a part of which z* has been fitted."""
+        import os
         design = self.features.design(white)
-        likelihood = Likelihood.of(solution, self.hierarchy.prior(design))
+        prior = self.hierarchy.prior(design)
+        likelihood = Likelihood.of(solution, prior)
         residual, jacobian = white.linearised(solution.x)
         covariance = self.hierarchy.posterior_covariance(design, likelihood)
-        variance = predicted_variance(jacobian, covariance)
-        lagged = predicted_lagged(jacobian, covariance)
-        learned = white.learned_noise(self.noise, residual, variance, lagged, FLOOR)
-        weights = self.noise.weights(white, residual)[..., None].sqrt()
-        repeated = self.features.repeated(white, weights * residual)
-        return replace(learned, thinning=learned.thinning * repeated)
+        noise = white.learned_noise(self.noise, residual, floor=FLOOR)
+        fitted = (likelihood.curvature * covariance).sum()
+        count = white.measured.sum() * white.observed.shape[2]
+        left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
+        noise = replace(noise, scale=noise.scale / left.sqrt())
+        used = replace(noise, thinning=self.noise.thinning)
+        factor = contradiction(
+            white, used, (residual, jacobian), covariance, self.features.index(white)
+        )
+        if os.environ.get('PR'): print('kappa',factor,'thin',self.noise.thinning.numpy(),noise.thinning.numpy(), noise.scale.numpy().ravel())
+        motion = torch.maximum(noise.thinning[1], factor * self.noise.thinning[1])
+        if os.environ.get('V')!='K': motion=noise.thinning[1]
+        return replace(noise, thinning=torch.stack([noise.thinning[0], motion]))
 
     def near(self, other: Hyperparameters) -> bool:
         """Whether all standard deviations are about those of `other`."""

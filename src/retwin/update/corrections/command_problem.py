@@ -243,12 +243,7 @@ class CommandProblem:
         return replace(self, whitening=None)
 
     def learned_noise(
-        self,
-        noise: Noise,
-        residual: Tensor,
-        variance: Tensor | float = 0.0,
-        lagged: Tensor | None = None,
-        floor: float = 1e-18,
+        self, noise: Noise, residual: Tensor, variance: Tensor | float = 0.0, floor: float = 1e-18
     ) -> Noise:
         """The noise at rest and in motion, see `Noise.learned`: a block of samples is a segment.
 
@@ -264,7 +259,6 @@ class CommandProblem:
             blocks=max(1.0, float(self.valid.sum())),
             rounding=(float(rounding.mean()), 0.0),
             variance=variance,
-            lagged=lagged,
             floor=floor,
         )
 

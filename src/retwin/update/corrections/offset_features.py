@@ -132,38 +132,10 @@ class OffsetFeatures:
             share=share,
         )
 
-    def repeated(self, problem: CommandProblem, residual: Tensor) -> Tensor:
-        """Samples (G,) per independent one, as residuals (n, S, d_y) repeat in replicates.
-
-        Errors of the path are those of the commands, so that the same commands show them again.
-        """
-        factor = residual.new_ones(2)
-        row, sample = (problem.measured > 0).nonzero().unbind(dim=1)
-        segment = problem.inside[row, :, sample].argmax(dim=1)
-        match = self._match(problem)[row, segment] & (problem.inside[row, :, sample].any(dim=1))[:, None]
-        some = match.any(dim=1)
-        if not some.any():
-            return factor
-        row, sample, segment, match = row[some], sample[some], segment[some], match[some]
-        time = problem.sample[row, sample] - torch.as_tensor(problem.segments.start)[row, segment]
-        step = problem.sample.diff(dim=1)
-        step = step[step > 0].double().median()
-        cell = torch.stack([match.long().argmax(dim=1), (time / step).round().long()], dim=1)
-        _, cell = cell.unique(dim=0, return_inverse=True)
-        values, group = residual[row, sample], problem.group[row, sample]
-        for k in range(2):
-            own = cell[group == k]
-            if not len(own):
-                continue
-            zero = values.new_zeros(int(cell.max()) + 1)
-            count = zero.index_add(0, own, torch.ones_like(own, dtype=zero.dtype))
-            part = values[group == k]
-            sums = zero[:, None].repeat(1, part.shape[1]).index_add(0, own, part)
-            square = zero.index_add(0, own, part.square().sum(dim=1))
-            pairs = (sums.square().sum(dim=1) - square).sum()
-            correlation = (pairs / ((count - 1) * square).sum().clamp_min(1e-30)).clamp(0, 1)
-            factor[k] = 1 + correlation * (count.square().sum() / count.sum() - 1)
-        return factor
+    def index(self, problem: CommandProblem) -> Tensor:
+        """(n, M) long, the condition of each segment, in order from 0."""
+        every = self.conditions(problem)
+        return every.flatten(0, 1).unique(dim=0, return_inverse=True)[1].view(every.shape[:2])
 
     def _match(self, problem: CommandProblem) -> Tensor:
         """(n, M, C) bool, whether a segment is a replicate of a condition."""
