@@ -24,7 +24,8 @@ from torch import Tensor
 from retwin.inference.priors import ROUNDING, GaussianPrior, inverse
 from retwin.inference.solver import Solution
 
-FREEDOM = 2.0
+import os
+FREEDOM = float(os.environ.get("NU","2"))
 """Degrees of freedom of the scaled inverse chi-squared hyperpriors: what a variance is expected to
 be counts as much as two observations."""
 TOLERANCE = 1e-3

@@ -253,23 +253,16 @@ class Hyperparameters:
         """The noise of residuals, to a part of which z* has been fitted."""
         import os
         design = self.features.design(white)
-        prior = self.hierarchy.prior(design)
-        likelihood = Likelihood.of(solution, prior)
-        residual, jacobian = white.linearised(solution.x)
+        likelihood = Likelihood.of(solution, self.hierarchy.prior(design))
         covariance = self.hierarchy.posterior_covariance(design, likelihood)
-        noise = white.learned_noise(self.noise, residual, floor=FLOOR)
+        d=float(self.features.index(white)[white.valid].unique().numel()) if not os.environ.get('ND') else 0
+        noise = white.learned_noise(self.noise, white.residual(solution.x), floor=FLOOR, distinct=d)
         fitted = (likelihood.curvature * covariance).sum()
         count = white.measured.sum() * white.observed.shape[2]
         left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
         noise = replace(noise, scale=noise.scale / left.sqrt())
-        used = replace(noise, thinning=self.noise.thinning)
-        factor = contradiction(
-            white, used, (residual, jacobian), covariance, self.features.index(white)
-        )
-        if os.environ.get('PR'): print('kappa',factor,'thin',self.noise.thinning.numpy(),noise.thinning.numpy(), noise.scale.numpy().ravel())
-        motion = torch.maximum(noise.thinning[1], factor * self.noise.thinning[1])
-        if os.environ.get('V')!='K': motion=noise.thinning[1]
-        return replace(noise, thinning=torch.stack([noise.thinning[0], motion]))
+        if os.environ.get('PR'): print('thin',noise.thinning.numpy(), noise.scale.numpy().ravel())
+        return noise
 
     def near(self, other: Hyperparameters) -> bool:
         """Whether all standard deviations are about those of `other`."""

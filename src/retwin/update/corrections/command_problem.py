@@ -1,6 +1,7 @@
 """The problem of `CommandSpace`: measured outputs, and the surrogate's outputs for any z."""
 
 from __future__ import annotations
+import os
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
@@ -243,7 +244,7 @@ class CommandProblem:
         return replace(self, whitening=None)
 
     def learned_noise(
-        self, noise: Noise, residual: Tensor, variance: Tensor | float = 0.0, floor: float = 1e-18
+        self, noise: Noise, residual: Tensor, variance: Tensor | float = 0.0, floor: float = 1e-18, distinct: float=0
     ) -> Noise:
         """The noise at rest and in motion, see `Noise.learned`: a block of samples is a segment.
 
@@ -255,8 +256,8 @@ class CommandProblem:
         return noise.learned(
             self,
             residual,
-            common=COMMON_ERROR,
-            blocks=max(1.0, float(self.valid.sum())),
+            common=(COMMON_ERROR, float(os.environ.get('CP','1'))),
+            blocks=(max(1.0, float(self.valid.sum())), distinct or max(1.0, float(self.valid.sum()))),
             rounding=(float(rounding.mean()), 0.0),
             variance=variance,
             floor=floor,

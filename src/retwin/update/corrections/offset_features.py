@@ -116,7 +116,7 @@ class OffsetFeatures:
         delay = own.new_tensor([DELAY_DEVIATION])
         single = (1 - match.sum(dim=-1)) * float(len(self.replicated) > 0)
         kinds = torch.arange(1, 1 + count).repeat(width)
-        share = own.new_tensor([1.0, 1.0, *[SMALL] * (count - 1)])
+        share = own.new_tensor([1.0, float(__import__("os").environ.get("CS","1")), *[SMALL] * (count - 1)])
         return Design(
             features.flatten(1, 2),
             group=group.repeat(segments),
