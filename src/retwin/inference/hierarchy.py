@@ -24,8 +24,7 @@ from torch import Tensor
 from retwin.inference.priors import ROUNDING, GaussianPrior, inverse
 from retwin.inference.solver import Solution
 
-import os
-FREEDOM = float(os.environ.get("NU","2"))
+FREEDOM = 2.0
 """Degrees of freedom of the scaled inverse chi-squared hyperpriors: what a variance is expected to
 be counts as much as two observations."""
 TOLERANCE = 1e-3

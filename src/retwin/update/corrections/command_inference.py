@@ -9,6 +9,7 @@ Whether an actuator missed a segment is decided by comparing evidence.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,7 +19,7 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.inference.em import expectation_maximisation
 from retwin.inference.hierarchy import Hierarchy, Likelihood
-from retwin.inference.noise import Noise
+from retwin.inference.noise import Noise, predicted_variance
 from retwin.inference.solver import Solution, blocks
 from retwin.threads import one_thread
 from retwin.update.corrections.command_problem import CommandProblem
@@ -32,8 +33,7 @@ from retwin.update.corrections.missed_segments import (
     fitted,
     searched,
 )
-from retwin.update.corrections.offset_features import OffsetFeatures
-from retwin.update.corrections.path_error import contradiction
+from retwin.update.corrections.offset_features import GRID_VARIANCE, OffsetFeatures
 from retwin.update.corrections.sample_noise import SampleNoise
 
 MAX_ROUNDS = 12
@@ -55,7 +55,7 @@ FIRST_ODDS = -4.0
 FIRST_JITTER = 1 / 35
 """Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
 SMALLEST_SHARE = 0.1
-"""Smallest share of the samples that is taken to be left after z* has been fitted to them."""
+"""Smallest share of the samples in motion that is taken to be left after z* has been fitted."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -205,12 +205,14 @@ class Hyperparameters:
         moved = (problem.distance * (1 - problem.missed) > 0).any(dim=-1) & problem.valid
         shown = moved if moved.any() else problem.valid
         delay = problem.per_segment(start)[..., 0][shown]
-        jitter = 1.4826 * (delay - delay.median()).abs().median() + FIRST_JITTER * problem.width
+        deviation = 1.4826 * (delay - delay.median()).abs().median()
+        jitter = deviation + FIRST_JITTER * problem.width
         measured = problem.measured > 0
         # The median of nothing is NaN.
         length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
         scale = length.clamp_min(FLOOR).expand(2, 1)
-        features = OffsetFeatures.of(problem)
+        expected = math.sqrt(float(deviation) ** 2 + GRID_VARIANCE)
+        features = replace(OffsetFeatures.of(problem), jitter=expected)
         offset = FIRST_OFFSET * features.spread
         design = features.design(problem)
         coefficients = torch.zeros(len(design.owner), dtype=torch.float64)
@@ -251,18 +253,20 @@ class Hyperparameters:
 
     def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
         """The noise of residuals, to a part of which z* has been fitted."""
-        import os
         design = self.features.design(white)
         likelihood = Likelihood.of(solution, self.hierarchy.prior(design))
         covariance = self.hierarchy.posterior_covariance(design, likelihood)
-        d=float(self.features.index(white)[white.valid].unique().numel()) if not os.environ.get('ND') else 0
-        noise = white.learned_noise(self.noise, white.residual(solution.x), floor=FLOOR, distinct=d)
-        fitted = (likelihood.curvature * covariance).sum()
-        count = white.measured.sum() * white.observed.shape[2]
-        left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
-        noise = replace(noise, scale=noise.scale / left.sqrt())
-        if os.environ.get('PR'): print('thin',noise.thinning.numpy(), noise.scale.numpy().ravel())
-        return noise
+        residual, jacobian = white.linearised(solution.x)
+        motion = (white.group == 1) & (white.measured > 0)
+        # What outputs in motion determine, of which the residual is left.
+        precision = self.noise.precision(white, residual)[motion]
+        fitted = (precision * predicted_variance(jacobian, covariance)[motion]).sum()
+        left = 1 - fitted / max(1, precision.numel())
+        within, residual = white.within_segments(residual, self.noise.weights(white, residual))
+        conditions = len(self.features.conditions(white)[white.valid].unique(dim=0))
+        noise = within.learned_noise(self.noise, residual, floor=FLOOR, conditions=conditions)
+        factor = torch.stack([torch.ones_like(left), left.clamp(SMALLEST_SHARE, 1.0).rsqrt()])
+        return replace(noise, scale=noise.scale * factor[:, None])
 
     def near(self, other: Hyperparameters) -> bool:
         """Whether all standard deviations are about those of `other`."""

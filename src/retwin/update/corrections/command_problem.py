@@ -1,7 +1,6 @@
 """The problem of `CommandSpace`: measured outputs, and the surrogate's outputs for any z."""
 
 from __future__ import annotations
-import os
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
@@ -30,10 +29,13 @@ COMMAND_STEP = 1e-4
 SETTLING = 0.5
 """Time after the end of a command's ramp in which an output may still be in motion, in largest
 delays."""
-COMMON_ERROR = 0.25
+COMMON_ERROR = 0.5
 """Variance of the error that all samples of a segment have in common, relative to that of one
 sample: what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
 resolution. Outputs cannot tell it from an offset, so it is no estimate."""
+PATH_ERROR = 1.0
+"""The same in motion: actuators go from level to level as they do, and not as commands do. All that
+is left may be such errors, since outputs cannot tell how much of it is."""
 LARGE_ERROR = 2.0
 """Error of the surrogate, in that of half of the samples, beyond which nothing is learned from a
 segment but its own z."""
@@ -243,21 +245,45 @@ class CommandProblem:
         """The same with residuals as they are."""
         return replace(self, whitening=None)
 
-    def learned_noise(
-        self, noise: Noise, residual: Tensor, variance: Tensor | float = 0.0, floor: float = 1e-18, distinct: float=0
-    ) -> Noise:
-        """The noise at rest and in motion, see `Noise.learned`: a block of samples is a segment.
+    def within_segments(self, residual: Tensor, weights: Tensor) -> tuple[CommandProblem, Tensor]:
+        """The problem and its residual (n, S, d_y) at rest about the mean of each segment.
 
-        In motion the errors by rounding are as good as independent.
+        What is constant throughout a rest is an offset, or as good as one: it is no noise. The
+        residual is as large as before its mean was subtracted, if samples are independent.
+        """
+        rest = self.inside * (self.group == 0)[:, None]
+        weighted = rest * weights[:, None]
+        mean = weighted @ residual / weighted.sum(dim=-1, keepdim=True).clamp_min(1e-12)
+        count = (rest.mT @ rest.sum(dim=-1, keepdim=True))[..., 0]
+        several = (count / (count - 1).clamp_min(1)).sqrt()[..., None]
+        residual = torch.where(
+            count[..., None] > 0, (residual - rest.mT @ mean) * several, residual
+        )
+        return replace(self, measured=self.measured * (count != 1)), residual
+
+    def learned_noise(
+        self,
+        noise: Noise,
+        residual: Tensor,
+        variance: Tensor | float = 0.0,
+        floor: float = 1e-18,
+        conditions: int | None = None,
+    ) -> Noise:
+        """The noise at rest and in motion, see `Noise.learned`.
+
+        A block of samples is a segment. In motion errors by rounding are as good as independent,
+        but those of the path are the same throughout a segment and in all its replicates, if
+        `conditions` is how many of the segments are different.
         """
         rounding = self.rounding
         if self.whitening is not None:
             rounding = self.whitening.square()[self.measured > 0].mean(dim=0) @ rounding
+        segments = max(1.0, float(self.valid.sum()))
         return noise.learned(
             self,
             residual,
-            common=(COMMON_ERROR, float(os.environ.get('CP','1'))),
-            blocks=(max(1.0, float(self.valid.sum())), distinct or max(1.0, float(self.valid.sum()))),
+            common=(COMMON_ERROR, PATH_ERROR if conditions else COMMON_ERROR),
+            blocks=(segments, float(conditions or segments)),
             rounding=(float(rounding.mean()), 0.0),
             variance=variance,
             floor=floor,

@@ -25,12 +25,12 @@ MAX_EFFECTS = 1000
 """Largest number of effects of conditions; of more conditions the last ones have none."""
 EQUAL = 0.01
 """Distance, in the spread of the targets, below which commands are equal."""
-DELAY_DEVIATION = math.sqrt(1 / 12)
-"""Standard deviation of the delays that the hyperprior expects, in samples: that of the time of an
-event within a sample."""
-SMALL = 0.01
-"""Expected variance of a regression's coefficients, relative to that of offsets: small unless data
-say more. A constant is expected to be as large as offsets are."""
+GRID_VARIANCE = 1 / 12
+"""Variance of the time of an event within a sample, in samples squared."""
+ZERO, SMALL = 16.0, 0.01
+"""Expected variance of an actuator's constant offset, and of the coefficients of a regression,
+relative to that of effects of conditions: where the zero of an actuator is says nothing of how much
+its offsets vary, and a regression explains little unless data say more."""
 WIDE = 30.0
 """Standard deviation of the prior, in that of a healthy offset, where a fault may be anything."""
 
@@ -47,6 +47,8 @@ class OffsetFeatures:
         (d_u,), root mean square of the distance from target to target.
     replicated : Tensor
         (C, 2 d_u), the conditions that are there more than once, see `conditions`.
+    jitter : float
+        Standard deviation of delays that the hyperprior expects, in samples.
     regression : bool
         Whether the mean of an offset depends on direction, distance and pose.
 
@@ -56,6 +58,7 @@ class OffsetFeatures:
     spread: Tensor
     travel: Tensor
     replicated: Tensor
+    jitter: float = math.sqrt(GRID_VARIANCE)
     regression: bool = False
 
     @classmethod
@@ -113,10 +116,10 @@ class OffsetFeatures:
         actuators = torch.arange(1, 1 + width)
         zero, last = torch.tensor([0]), torch.tensor([1 + width])
         group = torch.cat([zero, actuators, last.expand(problem.size - 1 - width)])
-        delay = own.new_tensor([DELAY_DEVIATION])
+        delay = own.new_tensor([self.jitter])
         single = (1 - match.sum(dim=-1)) * float(len(self.replicated) > 0)
         kinds = torch.arange(1, 1 + count).repeat(width)
-        share = own.new_tensor([1.0, float(__import__("os").environ.get("CS","1")), *[SMALL] * (count - 1)])
+        share = own.new_tensor([1.0, ZERO, *[SMALL] * (count - 1)])
         return Design(
             features.flatten(1, 2),
             group=group.repeat(segments),
@@ -131,11 +134,6 @@ class OffsetFeatures:
             unit=torch.cat([delay, self.spread, delay]),
             share=share,
         )
-
-    def index(self, problem: CommandProblem) -> Tensor:
-        """(n, M) long, the condition of each segment, in order from 0."""
-        every = self.conditions(problem)
-        return every.flatten(0, 1).unique(dim=0, return_inverse=True)[1].view(every.shape[:2])
 
     def _match(self, problem: CommandProblem) -> Tensor:
         """(n, M, C) bool, whether a segment is a replicate of a condition."""
