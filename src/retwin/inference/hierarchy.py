@@ -187,6 +187,14 @@ class Hierarchy:
         certain = variance.new_zeros(count, count)
         return cls(variance, common, design.share * level, coefficients, certain, flat)
 
+    def adapted(self, design: Design) -> Hierarchy:
+        """The same variances of errors to begin with for another regression."""
+        coefficients = self.variance.new_zeros(len(design.owner))
+        flat = design.kind == FLAT
+        coefficients[flat] = self.coefficients[: int(flat.sum())]
+        made = Hierarchy.of(design, self.total(), coefficients, self.flat)
+        return replace(made, variance=self.variance, common=self.common)
+
     def prior(self, design: Design) -> GaussianPrior:
         """The distribution of x at the most probable coefficients."""
         return GaussianPrior.independent(

@@ -26,6 +26,7 @@ from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.first_missed import first_missed
+from retwin.update.corrections.held_out_conditions import regression_predicts_better
 from retwin.update.corrections.missed_segments import (
     CommandFit,
     LatentPrior,
@@ -108,14 +109,18 @@ def infer_commands(
         return given.learned(problem.with_missed(found.fit.missed), found.fit.solution)
 
     fit = CommandFit.of_prior(problem, first.prior(problem), start)
-    found, learned = expectation_maximisation(
-        MissedSearch(fit, fit.missed, fit.evidence),
-        first,
-        infer=infer,
-        learn=learn,
-        rounds=MAX_ROUNDS,
-        converged=Hyperparameters.near,
-    )
+    found, learned = MissedSearch(fit, fit.missed, fit.evidence), first
+    for regression in (False, True):
+        if regression and not learned.explained(problem, found.fit):
+            break
+        found, learned = expectation_maximisation(
+            found,
+            learned.with_regression(problem) if regression else learned,
+            infer=infer,
+            learn=learn,
+            rounds=MAX_ROUNDS,
+            converged=Hyperparameters.near,
+        )
     if uncertain.common is not None:
         problem = uncertain
         found = infer(MissedSearch(fit, fit.missed, fit.evidence), learned)
@@ -228,6 +233,20 @@ class Hyperparameters:
             SampleNoise.of(problem),
             Noise(scale, one),
         )
+
+    def explained(self, problem: CommandProblem, fit: CommandFit) -> bool:
+        """Whether a regression predicts offsets under new conditions better than a constant."""
+        problem = self.whitened(problem.with_missed(fit.missed))
+        prior = self.prior(problem)
+        solution = fitted(problem, prior, self.noise, fit.x).solution
+        likelihood = Likelihood.of(solution, prior.gaussian)
+        return regression_predicts_better(self.features, self.hierarchy, problem, likelihood)
+
+    def with_regression(self, problem: CommandProblem) -> Hyperparameters:
+        """The same to begin with, where offsets depend on direction, distance and pose."""
+        features = replace(self.features, regression=True)
+        adapted = self.hierarchy.adapted(features.design(problem))
+        return replace(self, features=features, hierarchy=adapted)
 
     def whitened(self, problem: CommandProblem) -> CommandProblem:
         """The problem in which the errors of a sample's outputs are independent."""
