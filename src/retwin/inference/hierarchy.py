@@ -307,9 +307,7 @@ class Hierarchy:
         made = self._maximised(design, *sums, beta, None)
         return replace(made, coefficients=found.beta, covariance=found.uncertain)
 
-    def _drawn(
-        self, design: Design, found: _Posterior, rng: np.random.Generator
-    ) -> Hierarchy:
+    def _drawn(self, design: Design, found: _Posterior, rng: np.random.Generator) -> Hierarchy:
         """Variances from their distribution for a β and an x that are drawn."""
 
         def normal(like: Tensor) -> Tensor:
@@ -324,9 +322,7 @@ class Hierarchy:
         own, effect = self._parts(design)
         both = own * effect * self.total()[design.group]
         part = effect * error + both.sqrt() * normal(error)
-        return self._maximised(
-            design, (error - part).square(), part.square(), beta.square(), rng
-        )
+        return self._maximised(design, (error - part).square(), part.square(), beta.square(), rng)
 
     def _parts(self, design: Design) -> tuple[Tensor, Tensor]:
         """Shares (R, P) of a variable's variance that are the error's and the condition's."""
@@ -349,9 +345,7 @@ class Hierarchy:
         def grouped(values: Tensor) -> Tensor:
             return zero.index_add(0, design.group, values.sum(dim=0))
 
-        variance = self._variance(
-            design, grouped(error * used), grouped(used), self.variance, rng
-        )
+        variance = self._variance(design, grouped(error * used), grouped(used), self.variance, rng)
         total, count = grouped(effect * single), grouped(single)
         shown = ((design.features * used[..., None]).abs().sum(dim=(0, 1)) > 0).to(beta)
         shown = shown * (design.kind == CONDITION)

@@ -314,8 +314,7 @@ def _discrepancy(
         (common @ problem.per_segment(each)[..., None])[..., 0] for each in (found, prior.mean)
     )
     inner, wide = (
-        common @ blocks(each, segments) @ common.mT
-        for each in (covariance, prior.covariance)
+        common @ blocks(each, segments) @ common.mT for each in (covariance, prior.covariance)
     )
     left, wide = inner.diagonal(dim1=-2, dim2=-1), wide.diagonal(dim1=-2, dim2=-1)
     severity = torch.where(problem.faulty, (x - mean)[..., 1:], 0.0)

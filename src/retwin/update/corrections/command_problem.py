@@ -31,11 +31,8 @@ SETTLING = 0.5
 delays."""
 COMMON_ERROR = 0.5
 """Variance of the error that all samples of a segment have in common, relative to that of one
-sample: what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
-resolution. Outputs cannot tell it from an offset, so it is no estimate."""
-PATH_ERROR = 1.0
-"""The same in motion: actuators go from level to level as they do, and not as commands do. All that
-is left may be such errors, since outputs cannot tell how much of it is."""
+sample: what rounding leaves of a sensor whose noise is a quarter of its resolution, if glitches
+hardly count. Outputs cannot tell it from an offset, so it is no estimate."""
 LARGE_ERROR = 2.0
 """Error of the surrogate, in that of half of the samples, beyond which nothing is learned from a
 segment but its own z."""
@@ -271,19 +268,23 @@ class CommandProblem:
     ) -> Noise:
         """The noise at rest and in motion, see `Noise.learned`.
 
-        A block of samples is a segment. In motion errors by rounding are as good as independent,
-        but those of the path are the same throughout a segment and in all its replicates, if
-        `conditions` is how many of the segments are different.
+        A block of samples is a segment. In motion errors by rounding are as good as independent.
+        What outputs in motion err more than at rest is due to the path between levels, which is
+        not that of the commands; if `conditions`, the number of different segments, is given, that
+        error is the same throughout a segment and in all its replicates.
         """
+        common, blocks = COMMON_ERROR, max(1.0, float(self.valid.sum()))
+        if conditions:
+            path = 1 - float((noise.scale[0] / noise.scale[1]).square().mean())
+            common, blocks = max(common, path), float(conditions)
         rounding = self.rounding
         if self.whitening is not None:
             rounding = self.whitening.square()[self.measured > 0].mean(dim=0) @ rounding
-        segments = max(1.0, float(self.valid.sum()))
         return noise.learned(
             self,
             residual,
-            common=(COMMON_ERROR, PATH_ERROR if conditions else COMMON_ERROR),
-            blocks=(segments, float(conditions or segments)),
+            common=(COMMON_ERROR, common),
+            blocks=(max(1.0, float(self.valid.sum())), blocks),
             rounding=(float(rounding.mean()), 0.0),
             variance=variance,
             floor=floor,

@@ -49,8 +49,6 @@ def regression_predicts_better(
         for each in (False, True)
     )
     gain = regression - constant
-    import os
-    if os.environ.get("PR"): print("density", gain)
     # A gain that is within its standard error is none.
     return bool(gain.sum() > len(gain) ** 0.5 * gain.std())
 
