@@ -8,6 +8,7 @@ that fewer count than were measured: a first-order autoregression of coefficient
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,8 +99,8 @@ class Noise:
         problem: Problem,
         residual: Tensor,
         *,
-        common: tuple[float, ...],
-        blocks: tuple[float, ...],
+        common: Sequence[float],
+        blocks: Sequence[float],
         rounding: tuple[float, ...] = (),
         variance: Tensor | float = 0.0,
         floor: float = 1e-18,
@@ -114,10 +115,10 @@ class Noise:
             Of all rows that share the noise.
         residual : Tensor
             (R, K, d), at the most probable latent variables.
-        common : tuple of float
+        common : sequence of float
             Of each group, the variance of the error that is common to a block of samples, relative
             to that of a sample: it does not average out, however many samples a block has.
-        blocks : tuple of float
+        blocks : sequence of float
             The number of blocks of each group in all rows together, at least 1.
         rounding : tuple of float
             Variance of the error by rounding in each group, where values do not change in a block:
