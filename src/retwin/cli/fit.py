@@ -122,6 +122,13 @@ def fit(
     measured = _labelled(system, _measured(system, real, data, max_bytes, mapping))
     faults = system.faults if calibrate_on == "all" else calibrate_on
     calibrating(measured, faults)  # before a surrogate is trained, which takes minutes
+    require(
+        compare or system.diagnosed or dynamics or correction is not None,
+        "--no-compare",
+        expected="--dynamics or --correction with it, or a case with classes, whose own is taken",
+        got="neither",
+        remedy="name a method, or let the candidates be compared",
+    )
     forced = system.diagnosed or correction is not None or not compare or faults != "healthy"
     method = "dynamics" if dynamics else _own(system) if forced else ""
     trained = system.diagnosed or refine or any((network, twin_data, simulations))

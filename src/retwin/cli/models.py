@@ -174,6 +174,10 @@ def evaluate(
         note(f"Wrote predictions to {out}")
 
 
+CLEAR = 0.01
+"""Part of an error by which another predictor must be better to be mentioned."""
+
+
 def _verdict(scores: list[ModelScore]) -> list[str]:
     """What is better than the model, in sentences."""
     made = []
@@ -182,6 +186,6 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
     for each in scores:
         if each.who != "model":
             own = next(s for s in scores if s.who == "model" and s.output == each.output)
-            if each.rmse < own.rmse:
+            if each.rmse < (1 - CLEAR) * own.rmse:
                 made.append(f"{each.output}: {words[each.who]} is a better prediction.")
     return made

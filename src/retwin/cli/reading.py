@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from retwin.checks import existing, given
-from retwin.cli.terminal import bar
+from retwin.cli.terminal import bar, note
 from retwin.data.io import DataCase, load
 from retwin.data.trajectories import Trajectories
 
@@ -62,7 +62,18 @@ def read(
     max_bytes: int | None = None,
     mapping: Path | None = None,
 ) -> Trajectories:
-    """The trajectories of a file, with a bar while they are read; of a log by its mapping."""
+    """The trajectories of a file, with a bar while they are read; of a log by its mapping.
+
+    The columns of a table without a mapping have the names of the channels of the case's twin.
+    """
+    twin = getattr(case, "twin", None)
+    if mapping is None and twin is not None and file.suffix.lower() == ".csv" and file.is_file():
+        from retwin.cases import LogReader
+
+        found = LogReader(max_bytes=max_bytes).trajectories([file], twin)
+        for text in found.notes:
+            note(text)
+        return found.trajectories
     with bar("read") as show:
         return load(
             file,

@@ -20,7 +20,7 @@ from retwin.evaluation.choice.comparison import Comparison, Predicted, predict
 from retwin.evaluation.choice.fitted import CandidateScore, Fitted
 from retwin.evaluation.choice.folds import block_length, block_means, folds_of
 from retwin.evaluation.choice.remarks import remarks_of, without_twin
-from retwin.evaluation.choice.settings import Choice
+from retwin.evaluation.choice.settings import MEMBERS, Choice
 from retwin.evaluation.choice.trials import FAILURES, Trials, shorter, unstable
 from retwin.progress import Progress
 from retwin.scores.distributions import crps_normal
@@ -253,7 +253,8 @@ def with_yardstick(found: Fitted, *, seed: int = 0, progress: Progress | None = 
                 warnings.simplefilter("ignore")
                 predicted[kind] = []
                 for j, fold in enumerate(folds):
-                    model = fit_black_box(fold.training(records), kind, seed=seed).twin
+                    training = fold.training(records)
+                    model = fit_black_box(training, kind, members=MEMBERS, seed=seed).twin
                     predicted[kind].append(predict(model, records, fold, found.horizon))
                     report((i + (j + 1) / len(folds)) / len(BLACK_BOXES))
         except FAILURES as error:

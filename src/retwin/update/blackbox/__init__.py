@@ -33,7 +33,12 @@ BLACK_BOXES: Mapping[str, Callable[[Trajectories, int, Progress | None], BlackBo
 
 @one_thread()
 def fit_black_box(
-    observed: Trajectories, kind: str, *, seed: int = 0, progress: Progress | None = None
+    observed: Trajectories,
+    kind: str,
+    *,
+    members: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
 ) -> BlackBox:
     """A model of the outputs by the commands, from calibration records alone.
 
@@ -47,6 +52,8 @@ def fit_black_box(
     kind : str
         "arx", a linear model; "narx", a polynomial of past samples; "neural_ss", a linear
         state-space model with a small network inside its equations; "lstm", a recurrent network.
+    members : int, optional
+        Networks of an "lstm", whose outputs are averaged; fewer are faster and less accurate.
     seed : int
         Of the first weights of a network, at least 0.
     progress : callable, optional
@@ -67,4 +74,6 @@ def fit_black_box(
     """
     fit = BLACK_BOXES[one_of("kind", kind, BLACK_BOXES)]
     with np.errstate(over="ignore", invalid="ignore"):  # of models that diverge, and are not chosen
+        if fit is fit_lstm:
+            return fit_lstm(observed, checked_seed(seed), progress, members)
         return fit(observed, checked_seed(seed), progress)

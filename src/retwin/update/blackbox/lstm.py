@@ -24,16 +24,20 @@ from retwin.update.residual import SequenceMixture, fit_residual
 from retwin.update.surrogate import Surrogate
 
 
-def fit_lstm(observed: Trajectories, seed: int, progress: Progress | None) -> BlackBox:
-    """The network whose first weights are drawn with a seed."""
+def fit_lstm(
+    observed: Trajectories, seed: int, progress: Progress | None, members: int | None = None
+) -> BlackBox:
+    """The network whose first weights are drawn with a seed; `members` makes it a smaller one."""
     began = time.perf_counter()
     check_records(observed)
-    constant = _constant(observed)
+    constant, density = _constant(observed), SequenceMixture()
+    if members is not None:
+        density = replace(density, members=members, refit=False)
     residual = fit_residual(
         constant,
         observed,
         Additive(),
-        SequenceMixture(),
+        density,
         calibrate_on="all",  # the records have no fault
         seed=seed,
         progress=progress,

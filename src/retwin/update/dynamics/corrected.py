@@ -311,6 +311,8 @@ class CorrectedEquations:
         count = len(self.twin.states)
         by_all = [_by_parameters(self.twin, i, *self.visited) @ self.free for i in range(count)]
         columns = np.stack(by_all) / self.domain.speed[:, None, None]
+        if not columns.shape[2]:
+            return np.zeros((0, *columns.shape[:2]))
         basis, size, _ = np.linalg.svd(_scaled(columns.reshape(-1, columns.shape[2])), False)
         return basis[:, size > DISTINCT].T.reshape(-1, count, len(self.visited[0]))
 
