@@ -145,7 +145,7 @@ def test_the_page_on_identification(folder: Path, monkeypatch: pytest.MonkeyPatc
     runs = " ".join(f"run{i}.csv" for i in range(5))
     for line, whole in shown(DOCS / "identify.md"):
         # Those of a log and an FMU are in test_log_to_fmu.py.
-        if whole and not line.startswith(("fit", "export")) and "run.mcap" not in line:
+        if whole and not line.startswith(("fit", "evaluate", "export")) and "run.mcap" not in line:
             words = shlex.split(line.replace("run*.csv", runs))
             result = CliRunner().invoke(app, words, catch_exceptions=False)
             assert result.exit_code == 0, f"retwin {line}: {result.output}"

@@ -80,8 +80,9 @@ def test_state_equations_are_fitted_and_generate(folder: Path, tmp_path: Path, c
     learned = found["dynamics"]
     assert learned["figures"]["rms_after"] < 0.2 * learned["figures"]["rms_before"]
     assert next(iter(learned["terms"])).startswith("level: ")
-    assert {"gain", "leak"} <= {name for *pair, _ in learned["correlations"] for name in pair}
-    assert set(learned["errors"]) >= {"gain", "leak"}
+    assert learned["parameters"] == {}  # which keep the values that were identified
+    assert set(found["parameters"]) == {"gain", "leak"}
+    assert all(alone == now != before for before, alone, now in found["parameters"].values())
     scores = {each["name"]: each for each in found["candidates"]}
     assert found["chosen"] == "dynamics"
     assert scores["dynamics"]["rmse"]["level"] < 0.5 * scores["parameters"]["rmse"]["level"]

@@ -78,9 +78,15 @@ def test_finite_differences_are_a_warning_on_cost(measured: rt.Trajectories) -> 
 def test_what_needs_a_surrogate_is_refused(measured: rt.Trajectories, tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="DelayOffset cannot express what was measured"):
         residual = rt.fit_residual(TWIN, measured, rt.DelayOffset(), BRIEF, seed=0)
-    with pytest.raises(rt.InputError, match="can be opened again"):
-        rt.CorrectedTwin(TWIN, residual).save(tmp_path / "twin")
-    assert not (tmp_path / "twin").exists()
+    rt.CorrectedTwin(TWIN, residual).save(tmp_path / "twin")
+    with pytest.raises(rt.InputError, match=r"twin: expected the twin of this model"):
+        rt.load_twin(tmp_path / "twin")
+    again = rt.load_twin(tmp_path / "twin", TWIN)
+    np.testing.assert_allclose(
+        again.simulate(measured.commands, seed=1).nominal,
+        TWIN.simulate(measured.commands, seed=1).nominal,
+        rtol=1e-6,
+    )
     with pytest.raises(rt.InputError, match=r"surrogate: expected a surrogate, or a twin"):
         rt.fit_residual(object(), measured, rt.DelayOffset(), seed=0)  # type: ignore[call-overload]
     refined = rt.Mixture(

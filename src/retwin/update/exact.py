@@ -83,10 +83,11 @@ class ExactSurrogate(OfTwin):
             )
         return torch.as_tensor(self.predict(commands.numpy()))
 
-    def save(self, folder: str | Path, case: str = "") -> None:
+    def save(self, folder: str | Path, case: str | None = None) -> None:
         """Write the twin: its equations, or the name of the case whose twin it is, and its values.
 
-        Of a twin that has neither equations nor a case, `load` must be given the twin.
+        An empty name is that of a twin that `load` must be given. Raises InputError for a twin
+        without equations where there can be no name.
         """
         if isinstance(self.twin, DynamicsTwin):
             self.twin.save(folder)
@@ -95,6 +96,13 @@ class ExactSurrogate(OfTwin):
         if state_names(self.twin):
             about["equations"] = equations_of(with_present_values(self.twin))  # type: ignore[arg-type]
         else:
+            require(
+                case is not None,
+                "twin",
+                expected="a StateTwin, or a surrogate, which can be opened again",
+                got=type(self.twin).__name__,
+                remedy="fit a surrogate of it (fit_surrogate)",
+            )
             about["case"] = case
             if isinstance(self.twin, ParametricTwin):
                 about["values"] = dict(zip(self.twin.names, self.twin.values, strict=True))

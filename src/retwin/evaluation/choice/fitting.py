@@ -108,7 +108,7 @@ def fit(
     trials.run()
     comparison, reasons = trials.compared(settings.horizon)
     horizon = settings.horizon
-    if horizon is None and unstable(comparison, whole.updated):
+    if horizon is None and unstable(comparison, whole):
         horizon = shorter(whole)
         comparison, reasons = trials.compared(horizon)
     require(

@@ -16,7 +16,6 @@ from retwin.evaluation.choice.comparison import Comparison, predict
 from retwin.evaluation.choice.folds import Fold
 from retwin.progress import Progress
 from retwin.twins.collected import SimulationError
-from retwin.update.identification import Updated
 
 FAILURES = (InputError, SimulationError, RuntimeError, ArithmeticError, np.linalg.LinAlgError)
 """What ends a candidate, and not the comparison: refused records, diverging fits and trainings."""
@@ -92,7 +91,7 @@ class Trials:
         return self.whole.fits[name]()
 
 
-def unstable(comparison: Comparison, updated: Updated | None) -> bool:
+def unstable(comparison: Comparison, whole: Candidates) -> bool:
     """Whether free simulation is no way to judge candidates.
 
     All diverge, or none is better than the means of the outputs where already the parameters were
@@ -101,8 +100,9 @@ def unstable(comparison: Comparison, updated: Updated | None) -> bool:
     errors = [
         float(np.mean(comparison.rmse(name) / comparison.spread)) for name in comparison.predicted
     ]
-    integrates = updated is not None and np.isfinite(updated.horizon)
-    return not errors or (integrates and min(errors) >= 1.0)
+    if not errors or min(errors) < 1.0 or set(comparison.predicted) == {"none"}:
+        return not errors
+    return whole.updated is not None and bool(np.isfinite(whole.updated.horizon))
 
 
 def shorter(whole: Candidates) -> float:
