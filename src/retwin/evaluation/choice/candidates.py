@@ -60,13 +60,13 @@ class Candidates:
         made: dict[str, Callable[[], Model]] = {"none": self.none}
         if self.free is not None:
             made["parameters"] = self.parameters
-        if self._segmented("delay_offset"):
+        if self._has_segments("delay_offset"):
             made["delay_offset"] = lambda: self.per_segment(DelayOffset())
         if state_names(self.twin):
             made["dynamics"] = lambda: self.dynamics
         own = self.settings.correction
         own = own if own is not None and own.resolution == "segment" else None
-        if own is not None and own != DelayOffset() and self._segmented("segments"):
+        if own is not None and own != DelayOffset() and self._has_segments("segments"):
             made["segments"] = lambda: self.per_segment(own)
         made["output"] = lambda: self.per_sample(self.identified)
         if state_names(self.twin):
@@ -81,7 +81,7 @@ class Candidates:
             return self.twin.parametric() if self.twin.free else None
         return self.twin if isinstance(self.twin, ParametricTwin) else None
 
-    def _segmented(self, name: str) -> bool:
+    def _has_segments(self, name: str) -> bool:
         """Whether the commands move and rest, which a correction per segment needs."""
         if name == self.settings.method:
             return True

@@ -69,9 +69,9 @@ def fit(
     twin : Twin
         Any twin; a `StateTwin`, or a `ParametricTwin` of one, also has corrected state equations.
     records : Trajectories
-        Measured outputs with commands. Of labelled records the healthy ones are used.
+        Measured outputs with commands. Of labelled records the healthy ones are used by default.
     settings : Choice
-        The candidates, and the horizon at which they are judged; or a method, without a comparison.
+        The candidates, and the horizon at which they are judged; or the method that is taken.
     seed : int
         Of networks and searches; the same seed gives the same bytes on the same machine.
     case : str
@@ -93,7 +93,7 @@ def fit(
         or no candidate that can be fitted.
 
     """
-    began, records = time.perf_counter(), _used(records, settings)
+    began, records = time.perf_counter(), _select_records(records, settings)
     check_channels(twin, records, "records")
     alone = None if settings.compared else progress
     whole = Candidates(twin, records, settings, seed, case, original, alone)
@@ -102,15 +102,15 @@ def fit(
     # First, so that settings of a given method that are wrong are so before the comparison.
     given = whole.fits[settings.method]() if settings.method else None
     if given is not None and not settings.compared:
-        return _not_compared(whole, given, time.process_time() - since, began)
+        return _fit_alone(whole, given, time.process_time() - since, began)
     folds = folds_of(records)
     trials = Trials(whole, folds, names, progress or (lambda _: None))
     trials.run()
-    comparison, reasons = trials.compared(settings.horizon)
+    comparison, reasons = trials.compare(settings.horizon)
     horizon = settings.horizon
     if horizon is None and unstable(comparison, whole):
         horizon = shorter(whole)
-        comparison, reasons = trials.compared(horizon)
+        comparison, reasons = trials.compare(horizon)
     require(
         comparison.predicted,
         "twin",
@@ -120,7 +120,7 @@ def fit(
     )
     preferred, differences = comparison.simplest()
     chosen = settings.method or preferred
-    model = _calibrated(given or trials.final(chosen), trials, chosen, comparison)
+    model = _calibrate(given or trials.final(chosen), trials, chosen, comparison)
     scores = tuple(
         _row(name, comparison, differences, trials.seconds[name], reasons.get(name, ""))
         for name in trials.names
@@ -147,7 +147,7 @@ def fit(
     return with_yardstick(found, seed=seed) if settings.yardstick else found
 
 
-def _not_compared(whole: Candidates, model: Model, taken: float, began: float) -> Fitted:
+def _fit_alone(whole: Candidates, model: Model, taken: float, began: float) -> Fitted:
     """The given method, of which nothing but its own fit is known."""
     name, nothing = whole.settings.method, np.full(whole.records.observed.shape, np.nan)
     row = _row(name, None, {}, taken, "not compared")
@@ -172,7 +172,7 @@ def _not_compared(whole: Candidates, model: Model, taken: float, began: float) -
     )
 
 
-def _used(records: Trajectories, settings: Choice) -> Trajectories:
+def _select_records(records: Trajectories, settings: Choice) -> Trajectories:
     """The records to calibrate on; unlabelled ones are healthy where none has a label."""
     check_magnitude("calibration", records, ideal=True)
     if not records.known_labels and settings.calibrate_on == "healthy":
@@ -194,7 +194,7 @@ def _names(candidates: Candidates, settings: Choice) -> list[str]:
     return names
 
 
-def _calibrated(model: Model, trials: Trials, name: str, comparison: Comparison) -> Model:
+def _calibrate(model: Model, trials: Trials, name: str, comparison: Comparison) -> Model:
     """The model with bands that hold what the parts in time show."""
     records, found = trials.whole.records, []
     if name not in comparison.predicted:

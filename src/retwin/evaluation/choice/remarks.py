@@ -43,9 +43,9 @@ def remarks_of(
     made += _worse_than_mean(records, by_name[chosen])
     if len(records) < RECORDS:
         made.append(
-            f"Parts of {len(records)} record{'s' * (len(records) > 1)} were left out, no whole "
-            "records: the bands are those of further parts of the same. How another day or machine "
-            f"differs cannot be seen; {RECORDS} records or more show it."
+            f"Only parts of {len(records)} record{'s' * (len(records) > 1)} were left out: the "
+            "bands hold for further parts of the same. How much another day differs cannot be seen "
+            f"from fewer than {RECORDS} records, of which whole ones are left out."
         )
     if preferred in ("none", "parameters"):
         more = " with its identified parameters" if preferred == "parameters" else ""

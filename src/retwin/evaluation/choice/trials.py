@@ -68,7 +68,7 @@ class Trials:
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.process_time() - began
 
-    def compared(self, horizon: float | None) -> tuple[Comparison, dict[str, str]]:
+    def compare(self, horizon: float | None) -> tuple[Comparison, dict[str, str]]:
         """Of the candidates whose predictions stay finite, and why others have none."""
         records, reasons, predicted = self.whole.records, dict(self.reasons), {}
         for name in (each for each in self.names if each not in reasons):

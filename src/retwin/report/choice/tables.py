@@ -58,16 +58,11 @@ def comparison_table(found: Fitted) -> Table:
 
 def parameter_table(found: Fitted) -> Table:
     """The parameters before, identified, and in the model."""
-    rows = []
-    for name, values in found.parameters.items():
-        cells = [Cell(significant(each)) for each in values]
-        learned, strongest = found.learned, None
-        if learned is not None and name in learned.errors:
-            cells[-1] = Cell(cells[-1].text, f"± {significant(learned.errors[name])}")
-            strongest = learned.strongest(name)
-        text = f"{strongest[1]:+.2f} with {strongest[0]}" if strongest else ""
-        rows.append([Cell(name), *cells, Cell(text)])
-    heads = columns("parameter", "before", "identified", "in the model", "strongest correlation")
+    rows = [
+        [Cell(name), *(Cell(significant(each)) for each in values)]
+        for name, values in found.parameters.items()
+    ]
+    heads = columns("parameter", "before", "identified", "in the model")
     return Table("Parameters", heads, rows)
 
 
