@@ -23,13 +23,15 @@ from style import BLUE, GREEN, INK, MUTED, ORANGE, PINK, RULE, blank, dress, not
 from torch import Tensor
 
 import retwin as rt
-from retwin.cases.armpi_fpv.twin import ARM, KINEMATIC, POLL, UNIT
+from retwin.cases.armpi_fpv.twin import ARM, KINEMATIC, UNIT
 from retwin.nets.training import Training
 
 EMULATED, TOY = "Emulated robot, no real measurements", "A toy, no real measurements"
 COLOURS = {"CommandSpace": BLUE, "DelayOffset": ORANGE, "Additive": GREEN}
 STYLES = {"CommandSpace": "-", "DelayOffset": "--", "Additive": ":"}
 MM, RATE = 1000.0, KINEMATIC.rate
+POLL = round(0.1 * RATE)
+"""Samples between two polls of the sensor."""
 COUNT, DRAWS = 40, 150
 RADIUS_90 = 2.146
 """Radius, in standard deviations, of the ellipse that contains 90 % of a bivariate normal."""

@@ -306,4 +306,4 @@ def _print(found: Fitted, base: StandIn, out: Path, *, as_json: bool) -> None:
     failed = [f"{e.title}: {e.reason}" for e in found.scores if e.reason and found.parts]
     values = {"saved": str(out), **found.values, "surrogate": figures}
     answer(values, *shown, *found.remarks, *model_sentences(found), *failed, as_json=as_json)
-    note(f"Saved {out}, with the comparison in {out / 'report.html'}")
+    note(f"Saved {out}, with the report {out / 'report.html'}")
