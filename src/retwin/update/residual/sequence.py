@@ -61,6 +61,8 @@ class SequenceMixture:
     training : Training
         Settings of the training of each member, without early stopping; `batch_size` counts
         windows.
+    max_steps : int
+        Steps of the optimiser, at least 1: long records are trained on for fewer epochs.
 
     Raises
     ------
@@ -91,9 +93,10 @@ class SequenceMixture:
     training: Training = Training(  # noqa: RUF009 - frozen
         max_epochs=80, batch_size=6, learning_rate=5e-3, weight_decay=0.1
     )
+    max_steps: int = 2000
 
     def __post_init__(self) -> None:
-        counts = (self.features, self.components, self.block)
+        counts = (self.features, self.components, self.block, self.max_steps)
         sound = (
             min(counts) >= 1
             and self.members >= 2
@@ -105,7 +108,7 @@ class SequenceMixture:
         require(
             sound,
             "density",
-            expected="members of at least 2, features, components and block of at least 1, "
+            expected="members of at least 2, features, components, block, max_steps of at least 1, "
             "burn_in below window, dropout and moderation from 0 to 1",
             got=repr(self),
             remedy="leave out what you do not need to change",

@@ -132,7 +132,9 @@ def _train_members(
     a sum over members, so that gradients are those of each alone; the clipping is in proportion.
     """
     how, windows = model.density.training, data.windows(model.density, fitted)
-    how = replace(how, clip=how.clip * len(fitted) ** 0.5)
+    epochs = model.density.max_steps * how.batch_size // len(windows[0])
+    epochs = min(how.max_epochs, max(1, epochs))
+    how = replace(how, max_epochs=epochs, clip=how.clip * len(fitted) ** 0.5)
     return train(model.members, _objective(model), windows, None, how, seed=seed, progress=progress)
 
 
