@@ -14,7 +14,7 @@ import pytest
 from log_files import SPEEDS, csv, mcap, ros2_bag, tdms
 
 from retwin.data import load
-from retwin.data.logs import text_tables
+from retwin.data import tables as text_tables
 from retwin.data.logs.mapping import Mapping
 from retwin.data.logs.reading import read_log
 from retwin.data.logs.signals import Clock

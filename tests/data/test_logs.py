@@ -18,16 +18,16 @@ from log_files import BEGIN, COUNT, HEATER, RATE, SPEED, SPEEDS, TIMES, mcap, ro
 import retwin as rt
 from retwin.cases.twin_data import TwinData, log_case
 from retwin.data import Provenance, load, propose_mapping, read_mapping, save
-from retwin.data.logs import text_tables
+from retwin.data import tables as text_tables
 from retwin.data.logs.channels import in_order
 from retwin.data.logs.cutting import pieces
 from retwin.data.logs.mapped import mapped
 from retwin.data.logs.mapping import Cut, Mapping
 from retwin.data.logs.reading import read_log
 from retwin.data.logs.signals import Clock, Log, Signal, named_unit
-from retwin.data.logs.tables import row_times
 from retwin.data.logs.units import compatible, converted
 from retwin.data.resampling import resampled
+from retwin.data.row_times import row_times
 from retwin.errors import InputError
 from retwin.report.log_picture import _thinned
 from retwin.serialisation.sizes import Budget

@@ -15,11 +15,13 @@ from pyarrow import parquet
 
 import retwin as rt
 from retwin.data.logs.mapping import Mapping
+from retwin.data.logs.signals import Clock
+from retwin.data.row_times import row_times
 from retwin.errors import InputError
 from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.folder import Folder
-from retwin.monitor.sources.mapped_tables import mapped_layout
-from retwin.monitor.sources.tables import CHUNK, Layout, layout_of
+from retwin.monitor.sources.layouts import layout_of, mapped_layout
+from retwin.monitor.sources.tables import CHUNK, Layout
 
 SECOND = 10**9
 CHANNELS = ("heater", "T1")
@@ -196,7 +198,7 @@ def test_columns_are_those_of_the_case_unless_they_are_given() -> None:
     ],
 )
 def test_times_are_read_exactly(unit: str, cell: str, expected: int) -> None:
-    assert Layout("time", unit, ()).nanoseconds(cell) == expected
+    assert row_times(np.array([cell]), "", Clock(unit=unit), "a").tolist() == [expected]
 
 
 TWIN = {

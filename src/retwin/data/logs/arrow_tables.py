@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from retwin.checks import at_most, needs_extra
 from retwin.data.logs.signals import MAX_SIGNALS, UNWANTED, Clock, Signal, Skipped, named_unit
-from retwin.data.logs.tables import table_signals, time_column
+from retwin.data.row_times import time_column
+from retwin.data.tables import Table
 
 FILES = (b"ARROW1", b"FEA1\0\0")
 """How files of Arrow begin that are no streams."""
@@ -22,7 +23,14 @@ MAX_ELEMENTS = 64
 
 
 def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
-    """The signals of a table: its columns of numbers; see `data.logs.signals.Reader`.
+    """The signals of a table: its columns of numbers; see `data.logs.signals.Reader`."""
+    table, left_out = read_table(path, wanted, clock)
+    yield from (Skipped(name, UNWANTED) for name in left_out)
+    yield from table.signals(clock, wanted)
+
+
+def read_table(path: Path, wanted: frozenset[str] | None, clock: Clock) -> tuple[Table, list[str]]:
+    """The columns that may be wanted, and the names of the others.
 
     Fields of structures are `column.field`, elements of lists of one length `column[0]`. The unit
     is in the title, or in the metadata of the column under `unit`.
@@ -30,11 +38,11 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
     arrow = needs_extra("pyarrow", "logs", "reads Parquet and Arrow")
     needs_extra("pyarrow.compute", "logs", "takes structures apart")
     table, left_out = _table(path, arrow, wanted, clock)
-    yield from (Skipped(name, UNWANTED) for name in left_out)
     columns: dict[str, Any] = {}
     units: dict[str, str] = {}
     for field, column in zip(table.schema, table.columns, strict=True):
         name, unit = named_unit(field.name)
+        name = field.name if name in columns else name
         about = field.metadata or {}
         unit = unit or about.get(b"unit", b"").decode("utf-8", "replace")
         for own, leaf in _leaves(arrow, name, column, 0):
@@ -42,33 +50,26 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
             remedy = "write those that are wanted to a file of their own"
             at_most(path.name, len(columns), MAX_SIGNALS, "columns", remedy=remedy)
 
-    def numeric(name: str) -> tuple[NDArray, int] | str:
-        kind = columns[name].type
-        types = arrow.types
-        if not (
-            types.is_integer(kind)
-            or types.is_floating(kind)
-            or types.is_boolean(kind)
-            or types.is_decimal(kind)
-        ):
-            return f"of type {str(kind)[:40]}"
-        column = columns[name]
-        if types.is_boolean(kind):
-            column = column.cast("int8")
-        made = column.cast("double", safe=False).to_numpy()
-        return np.asarray(made, dtype=float), 0
-
-    def stamps(name: str) -> NDArray:
-        column = columns[name]
-        if arrow.types.is_timestamp(column.type):
-            column = column.cast("timestamp[ns]", safe=False).cast("int64")
-            made = column.to_numpy()
+    def cells(name: str) -> NDArray:
+        column, types = columns[name], arrow.types
+        if types.is_timestamp(column.type):
+            made = column.cast("timestamp[ns]", safe=False).cast("int64").to_numpy()
             missing = np.isnan(made) if made.dtype.kind == "f" else np.zeros(len(made), bool)
             whole = np.where(missing, 0, made).astype("datetime64[ns]")
             return np.where(missing, np.datetime64("NaT"), whole)
+        if types.is_boolean(column.type):
+            column = column.cast("int8")
+        elif types.is_decimal(column.type):
+            column = column.cast("double", safe=False)
         return np.asarray(column.to_numpy())
 
-    yield from table_signals(path.name, units, numeric, stamps, table.num_rows, clock, wanted)
+    numeric = ("is_integer", "is_floating", "is_boolean", "is_decimal")
+    others = {
+        name: f"of type {str(column.type)[:40]}"
+        for name, column in columns.items()
+        if not any(getattr(arrow.types, each)(column.type) for each in numeric)
+    }
+    return Table(path.name, units, table.num_rows, cells, others=others), left_out
 
 
 def _table(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from retwin.data.io.assembly import DataCase
 from retwin.data.logs.mapping import ChannelMapping, Cut, TimeSettings
 from retwin.data.logs.signals import NO_STAMP, Log
-from retwin.data.logs.tables import TIMES
+from retwin.data.tables import TIMES
 from retwin.serialisation.configs import toml_text
 
 MAX_LISTED = 200

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from retwin.catalog import LOGS, resolve
 from retwin.checks import require
-from retwin.data.logs import text_tables
+from retwin.data import tables
 from retwin.data.logs.signals import MAX_SIGNALS, NANOSECOND, Clock, Log, Signal
 from retwin.data.logs.worker import FRAME
 from retwin.errors import InputError, brief
@@ -113,7 +113,7 @@ def read_log(
     }
     signals: dict[str, Signal] = {}
     skipped: dict[str, str] = {}
-    here = size <= SAFE and resolve(LOGS[kind].reader) is text_tables.read
+    here = size <= SAFE and resolve(LOGS[kind].reader) is tables.read
     for each in (_read_here if here else _frames)(path, request, budget):
         if isinstance(each, Signal):
             signals[each.name] = each
@@ -143,7 +143,7 @@ def _read_here(
     wanted = None if request["wanted"] is None else frozenset(request["wanted"])
     count = 0
     try:
-        for each in text_tables.read(path, wanted, Clock(**request["clock"])):
+        for each in tables.read(path, wanted, Clock(**request["clock"])):
             count += 1
             if count > MAX_SIGNALS:
                 raise _refused(path, "more signals than can be")

@@ -19,7 +19,7 @@ from retwin.monitor.gate import Gate
 from retwin.monitor.samples import LONGEST, SECOND, Trajectory
 from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.folder import Files
-from retwin.monitor.sources.tables import layout_of
+from retwin.monitor.sources.layouts import layout_of
 from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.updates import EARLIEST
 from retwin.twins.twin import check_channels

@@ -1,0 +1,136 @@
+"""The layout of growing tables: by columns that are named, or by the mapping of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from retwin.cases.case import Case
+from retwin.cases.columns import ColumnRecords
+from retwin.checks import require, same_names
+from retwin.data.io.assembly import DataCase
+from retwin.data.logs.channels import table_of
+from retwin.data.logs.mapping import Mapping
+from retwin.data.trajectories import Channels
+from retwin.monitor.settings import FolderSource
+from retwin.monitor.sources.tables import Layout
+
+REMEDY = "leave it out of the mapping of this source, or write complete logs"
+
+
+def layout_of(settings: FolderSource, channels: Sequence[str], case: Case | None) -> Layout:
+    """The columns of the settings, else those of the case's records, else names of the channels.
+
+    Raises
+    ------
+    InputError
+        A channel has no column, or there is another; or the records of the case differ.
+
+    """
+    records = case.records if case is not None else None
+    known = records.every_record if isinstance(records, ColumnRecords) else ()
+    columns = settings.columns or _same(
+        [dict(each.columns) for each in known], "columns", {name: name for name in channels}
+    )
+    remedy = 'write for each channel NAME = "COLUMN"'
+    same_names("sources.columns", columns, channels, "a column for each of", remedy=remedy)
+    clocks = [each.clock for each in known if each.clock is not None]
+    time = settings.time or _same([each.column for each in clocks], "time", "time")
+    unit = settings.unit or _same([each.unit for each in clocks], "unit", "s")
+    several = [columns[name] for name in channels]
+    return Layout(time, unit, tuple((e,) if isinstance(e, str) else tuple(e) for e in several))
+
+
+def mapped_layout(
+    mapping: Mapping, inputs: Channels, outputs: Channels, rate: float, case: DataCase | None
+) -> Layout:
+    """How a mapping is applied to rows as they appear.
+
+    Parameters
+    ----------
+    mapping : Mapping
+        The settings. The class of the log and nominal outputs are of no use in a stream.
+    inputs, outputs : Channels
+        Those of the twin.
+    rate : float
+        Its sample rate in Hz.
+    case : DataCase or None
+        As logs are read with: whether a unit of "1" is one.
+
+    Raises
+    ------
+    InputError
+        The channels are not those of the twin, or a setting needs later rows or a whole log.
+
+    """
+    stated = case is not None and bool(case.classes)
+    commands = table_of(mapping.commands, inputs, "commands", stated=stated)
+    measured = table_of(mapping.outputs, outputs, "outputs", stated=stated)
+    _check_stream(mapping, rate)
+    for table, channels, how, reason in (
+        ("commands", commands, ("linear",), "it is held until the next row, which is not there"),
+        ("outputs", measured, ("hold",), "what was not measured is missing"),
+    ):
+        for name, own, _ in channels:
+            require(
+                own.resample not in how,
+                f"mapping: {table}.{name}.resample",
+                expected=f"another one for rows as they appear: {reason}",
+                got=own.resample,
+                remedy=REMEDY,
+            )
+    every = (*commands, *measured)
+    offsets = sorted({own.clock_offset for _, own, _ in every})
+    require(
+        len(offsets) == 1,
+        "mapping: clock_offset",
+        expected="the same for all channels, since a row of a stream has one time",
+        got=", ".join(f"{each:g} s" for each in offsets),
+        remedy="write channels with clocks of their own to topics or nodes of their own: MQTT or "
+        "OPC UA",
+    )
+    time, columns = mapping.time, tuple(tuple(own.signals) for _, own, _ in every)
+    return Layout(time.column, time.unit, columns, time.format, every, len(commands))
+
+
+def _check_stream(mapping: Mapping, rate: float) -> None:
+    """Refuse what has no meaning for rows that appear one after the other."""
+    cut, time = mapping.cut, mapping.time
+    require(
+        mapping.rate is None or np.isclose(mapping.rate, rate, rtol=1e-6),
+        "mapping: rate",
+        expected=f"that of the twin, {rate:g} Hz",
+        got=f"{mapping.rate:g} Hz" if mapping.rate else "none",
+        remedy="leave it out: samples come to the sample rate of the twin",
+    )
+    require(
+        time.rate is None,
+        "mapping: time.rate",
+        expected="a column of times, since a file that is replaced starts again",
+        got=f"rows at {time.rate or 0:g} Hz without times",
+        remedy="write the time of each row, and name its column",
+    )
+    cuts = {"trigger": cut.by == "trigger", "length": cut.by == "length"}
+    cuts["min_length"] = cut.min_length is not None
+    found = [name for name, given in cuts.items() if given]
+    require(
+        not found,
+        "mapping: cut",
+        expected="all rows of a stream, of which nothing is left out",
+        got=f"a cut by {found[0]}" if found else "",
+        remedy=REMEDY,
+    )
+
+
+def _same(found: list[Any], what: str, default: Any) -> Any:
+    """What all records of a case have in common, or the default where there are none."""
+    require(
+        all(each == found[0] for each in found),
+        f"sources.{what}",
+        expected=f"the {what} of the files",
+        got="none, and records of the case that differ in it",
+        remedy=f"give `{what}` in the source",
+    )
+    return found[0] if found else default
