@@ -79,21 +79,22 @@ class Layout:
 
 
 def begin_of(path: Path) -> tuple[list[str], str]:
-    """The first lines, and the encoding: UTF-8, UTF-16 by its mark, else that of Western Windows,
-    which has all bytes.
-    """
+    """The first lines, and the encoding."""
     with path.open("rb") as binary:
-        begin = binary.read(2**20)
-    encoding = "utf-8-sig"
-    if begin[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        encoding = "utf-16"
-    else:
-        try:
-            begin[: begin.rfind(b"\n") + 1].decode("utf-8")
-        except UnicodeDecodeError:
-            encoding = "latin-1"
+        encoding = encoding_of(binary.read(2**20))
     with opened(path, encoding) as file:
         return list(islice(lines_of(file, path), HEAD)), encoding
+
+
+def encoding_of(begin: bytes) -> str:
+    """UTF-8, UTF-16 by its mark, else that of Western Windows, which has all bytes."""
+    if begin[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    try:
+        begin[: begin.rfind(b"\n") + 1].decode("utf-8")
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8-sig"
 
 
 def opened(path: Path, encoding: str) -> TextIO:
@@ -202,27 +203,24 @@ def _by_titles(
 
 def _by_numbers(lines: Sequence[str], place: str) -> tuple[str, int, Row, Row]:
     """Separator, line of the first row of numbers, titles and units."""
-    best: tuple[int, int, str, list[Row]] | None = None
+    found = []
     for separator in (*SEPARATORS, ""):
         rows = list(rows_of(lines, separator, place))
         first = _first_row(rows, comma=separator != ",")
-        if first is not None:
+        several = first is not None and _width(rows, first) > 1
+        if first is not None and (several or separator == ","):
+            values = [cell for cell in rows[first] if cell.strip()]
+            count = sum(_is_value(cell, separator != ",") for cell in values)
             # More numbers win; blanks only where nothing else separates.
-            count = sum(_is_value(cell, separator != ",") for cell in rows[first] if cell.strip())
-            if _width(rows, first) > 1 and (best is None or (count > best[0] and separator)):
-                best = (count, first, separator, rows)
-    if best is None:
-        rows = list(rows_of(lines, ",", place))
-        first = _first_row(rows, comma=False)
-        if first is None:
-            raise InputError(
-                place,
-                expected="a table of numbers",
-                got=repr(lines[0].strip()[:60]) if lines else "an empty file",
-                remedy="check that it is the right file",
-            )
-        best = (1, first, ",", rows)
-    _, first, separator, rows = best
+            found.append(((several, bool(separator), count), separator, first, rows))
+    require(
+        found,
+        place,
+        expected="a table of numbers",
+        got=repr(lines[0].strip()[:60]) if lines else "an empty file",
+        remedy="check that it is the right file",
+    )
+    _, separator, first, rows = max(found, key=lambda each: each[0])
     width = _width(rows, first)
     head = [row[:width] for row in _head(rows[:first], width, place)][-2:]
     # A second row of titles holds units.

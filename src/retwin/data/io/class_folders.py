@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-import warnings
+from array import array
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from retwin.data.io.assembly import DataCase, Raw, assemble
 from retwin.data.io.mat import mat_variables, matrix
 from retwin.data.io.mat5 import Opaque
 from retwin.data.trajectories import Channels, Provenance, Trajectories
-from retwin.errors import InputError, brief
+from retwin.errors import InputError
 from retwin.progress import Progress, tracked
 from retwin.serialisation.files import sha256
 from retwin.serialisation.sizes import Budget
@@ -107,47 +107,31 @@ def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget) -> 
         for part in iter(lambda: blocks.read(BYTES_PER_BLOCK), b""):
             numbers = 1 + part.count(b",") + part.count(b"\n")
             budget.take(max(BYTES_PER_NUMBER * numbers, len(part)))  # a line may be a whole file
-    try:
-        with file.open(encoding="utf-8-sig") as lines, warnings.catch_warnings():
-            warnings.simplefilter("error")  # numpy only warns when there is no row at all
-            block = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
-    except Exception as error:
-        raise _csv_error(file, where, brief(error)) from None
-    label = file.parent.name
-    return Raw.of_columns(block, where, case, label, f"{label}/{file.stem}")
-
-
-def _csv_error(file: Path, where: str, fallback: str) -> InputError:
-    """The error that names the first bad line of a CSV file, `fallback` if no line is bad."""
-    got, width = None, 0
+    label, values, width, got = file.parent.name, array("d"), 0, "no rows"
     with file.open(encoding="utf-8-sig", errors="replace") as lines:
         for number, line in enumerate(lines, start=1):
-            if not line.strip():
-                continue
             fields = line.strip().split(",")
-            bad = [field for field in fields if not _is_number(field)]
-            if bad:
-                got = f"{bad[0].strip()[:40]!r} in line {number}"
+            if fields == [""]:
+                continue
+            width, got, before = width or len(fields), "", len(values)
+            try:
+                values.extend(map(float, fields))
+            except ValueError:  # at the first field that is no number
+                bad = fields[len(values) - before].strip()[:40]
+                got = f"{bad!r} in line {number}"
                 break
-            width = width or len(fields)
             if len(fields) != width:
                 got = f"{len(fields)} columns in line {number} after {width} before"
                 break
-    got = got or (fallback if width else "no rows")
-    return InputError(
+    require(
+        not got,
         where,
         expected="rows of numbers with commas between, all of one length, without a header",
         got=got,
         remedy="repair that line ('nan' stands for a missing measurement)",
     )
-
-
-def _is_number(field: str) -> bool:
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
+    block = np.frombuffer(values).reshape(-1, width)
+    return Raw.of_columns(block, where, case, label, f"{label}/{file.stem}")
 
 
 def _read_dataset(file: Path, where: str, case: DataCase | None, budget: Budget) -> Raw:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from retwin.catalog import LOGS, resolve
 from retwin.checks import require
 from retwin.data import tables
-from retwin.data.logs.signals import MAX_SIGNALS, NANOSECOND, Clock, Log, Signal
+from retwin.data.logs.signals import MAX_SIGNALS, NANOSECOND, Clock, Log, Signal, Skipped
 from retwin.data.logs.worker import FRAME
 from retwin.errors import InputError, brief
 from retwin.processes import scratch_folder
@@ -114,13 +114,16 @@ def read_log(
     signals: dict[str, Signal] = {}
     skipped: dict[str, str] = {}
     here = size <= SAFE and resolve(LOGS[kind].reader) is tables.read
-    for each in (_read_here if here else _frames)(path, request, budget):
-        if isinstance(each, Signal):
-            signals[each.name] = each
-            if progress is not None and wanted:
-                progress(len(signals) / len(wanted))
-        else:
-            skipped[each[0]] = each[1]
+    found = (_read_here if here else _frames)(path, request, budget)
+    for count, each in enumerate(found, 1):
+        if count > MAX_SIGNALS:
+            raise _refused(path, "more signals than can be")
+        if isinstance(each, Skipped):
+            skipped[each.name] = each.reason
+            continue
+        signals[each.name] = each
+        if progress is not None and wanted:
+            progress(len(signals) / len(wanted))
     require(
         signals or wanted is not None,  # what is missing then is named with what is alike
         path.name,
@@ -136,22 +139,13 @@ def read_log(
     return Log(path.resolve().name, sha256(path), begin, shifted, skipped)
 
 
-def _read_here(
-    path: Path, request: dict[str, Any], budget: Budget
-) -> Iterator[Signal | tuple[str, str]]:
+def _read_here(path: Path, request: dict[str, Any], budget: Budget) -> Iterator[Signal | Skipped]:
     """What the reader of a small table of text finds, with the limits of the other way."""
     wanted = None if request["wanted"] is None else frozenset(request["wanted"])
-    count = 0
     try:
         for each in tables.read(path, wanted, Clock(**request["clock"])):
-            count += 1
-            if count > MAX_SIGNALS:
-                raise _refused(path, "more signals than can be")
-            if isinstance(each, Signal):
-                budget.take(BYTES_PER_VALUE * len(each.times))
-                yield each
-            else:
-                yield each.name, each.reason
+            budget.take(BYTES_PER_VALUE * len(each.times) if isinstance(each, Signal) else 0)
+            yield each
     except InputError:
         raise
     except Exception as error:
@@ -172,9 +166,7 @@ def _files(path: Path) -> list[Path]:
     return files
 
 
-def _frames(
-    path: Path, request: dict[str, Any], budget: Budget
-) -> Iterator[Signal | tuple[str, str]]:
+def _frames(path: Path, request: dict[str, Any], budget: Budget) -> Iterator[Signal | Skipped]:
     """What the process that reads the log sends."""
     paths = [os.path.abspath(each) for each in sys.path if each]
     # Libraries unpack to temporary files, which they leave where they fail.
@@ -190,7 +182,6 @@ def _frames(
         )
         assert process.stdin is not None
         assert process.stdout is not None
-        count = 0
         try:
             with suppress(BrokenPipeError):  # it ended at once, which the next lines notice
                 process.stdin.write(json.dumps(request).encode())
@@ -203,9 +194,6 @@ def _frames(
                     return
                 if "begun" in about:
                     continue
-                count += 1
-                if count > MAX_SIGNALS:
-                    raise _refused(path, "more signals than can be")
                 yield _received(path, about, process, budget)
         finally:
             process.kill()
@@ -215,7 +203,7 @@ def _frames(
 
 def _received(
     path: Path, about: dict[str, Any], process: subprocess.Popen[bytes], budget: Budget
-) -> Signal | tuple[str, str]:
+) -> Signal | Skipped:
     """The signal, or the error, of one frame."""
     assert process.stdout is not None
     if "error" in about:
@@ -226,7 +214,7 @@ def _received(
     if "damaged" in about:
         raise _refused(path, str(about["damaged"]))
     if "skipped" in about:
-        return str(about["skipped"]), str(about["reason"])
+        return Skipped(str(about["skipped"]), str(about["reason"]))
     count = int(about["count"])
     budget.take(BYTES_PER_VALUE * count)
     times = _array(process.stdout, count, "<i8")
@@ -251,14 +239,8 @@ def _text(stream: IO[bytes]) -> dict[str, Any] | None:
 
 def _array(stream: IO[bytes], count: int, dtype: str) -> NDArray | None:
     made = np.empty(count, dtype)
-    view = memoryview(made.view(np.uint8).data)
-    done = 0
-    while done < len(view):
-        part = stream.readinto(view[done:])  # type: ignore[attr-defined]
-        if not part:
-            return None
-        done += part
-    return made
+    done = stream.readinto(made.view(np.uint8).data)  # type: ignore[attr-defined]
+    return made if done == made.nbytes else None
 
 
 def _ended(path: Path, process: subprocess.Popen[bytes]) -> InputError:

@@ -68,60 +68,47 @@ def mapped_layout(
     stated = case is not None and bool(case.classes)
     commands = table_of(mapping.commands, inputs, "commands", stated=stated)
     measured = table_of(mapping.outputs, outputs, "outputs", stated=stated)
-    _check_stream(mapping, rate)
-    for table, channels, how, reason in (
-        ("commands", commands, ("linear",), "it is held until the next row, which is not there"),
-        ("outputs", measured, ("hold",), "what was not measured is missing"),
-    ):
-        for name, own, _ in channels:
-            require(
-                own.resample not in how,
-                f"mapping: {table}.{name}.resample",
-                expected=f"another one for rows as they appear: {reason}",
-                got=own.resample,
-                remedy=REMEDY,
+    every, cut, time = (*commands, *measured), mapping.cut, mapping.time
+    held = "another one for rows as they appear: it is held until the next row, which is not there"
+    missing = "another one for rows as they appear: what was not measured is missing"
+    whole = "all rows of a stream, of which nothing is left out"
+    for key, got, fine, expected in (
+        (
+            "rate",
+            mapping.rate,
+            mapping.rate is None or np.isclose(mapping.rate, rate, rtol=1e-6),
+            f"that of the twin, {rate:g} Hz, to which samples come",
+        ),
+        (
+            "time.rate",
+            time.rate,
+            time.rate is None,
+            "a column of times, since a file that is replaced starts again",
+        ),
+        ("cut.by", cut.by, cut.by in ("none", "gap"), whole),
+        ("cut.min_length", cut.min_length, cut.min_length is None, whole),
+        *(
+            (f"commands.{name}.resample", own.resample, own.resample != "linear", held)
+            for name, own, _ in commands
+        ),
+        *(
+            (f"outputs.{name}.resample", own.resample, own.resample != "hold", missing)
+            for name, own, _ in measured
+        ),
+        *(
+            (
+                f"clock_offset of {name}",
+                own.clock_offset,
+                own.clock_offset == every[0][1].clock_offset,
+                "the same for all channels, since a row of a stream has one time; MQTT and OPC UA "
+                "take channels with clocks of their own",
             )
-    every = (*commands, *measured)
-    offsets = sorted({own.clock_offset for _, own, _ in every})
-    require(
-        len(offsets) == 1,
-        "mapping: clock_offset",
-        expected="the same for all channels, since a row of a stream has one time",
-        got=", ".join(f"{each:g} s" for each in offsets),
-        remedy="write channels with clocks of their own to topics or nodes of their own: MQTT or "
-        "OPC UA",
-    )
-    time, columns = mapping.time, tuple(tuple(own.signals) for _, own, _ in every)
+            for name, own, _ in every
+        ),
+    ):
+        require(fine, f"mapping: {key}", expected=expected, got=got, remedy=REMEDY)
+    columns = tuple(tuple(own.signals) for _, own, _ in every)
     return Layout(time.column, time.unit, columns, time.format, every, len(commands))
-
-
-def _check_stream(mapping: Mapping, rate: float) -> None:
-    """Refuse what has no meaning for rows that appear one after the other."""
-    cut, time = mapping.cut, mapping.time
-    require(
-        mapping.rate is None or np.isclose(mapping.rate, rate, rtol=1e-6),
-        "mapping: rate",
-        expected=f"that of the twin, {rate:g} Hz",
-        got=f"{mapping.rate:g} Hz" if mapping.rate else "none",
-        remedy="leave it out: samples come to the sample rate of the twin",
-    )
-    require(
-        time.rate is None,
-        "mapping: time.rate",
-        expected="a column of times, since a file that is replaced starts again",
-        got=f"rows at {time.rate or 0:g} Hz without times",
-        remedy="write the time of each row, and name its column",
-    )
-    cuts = {"trigger": cut.by == "trigger", "length": cut.by == "length"}
-    cuts["min_length"] = cut.min_length is not None
-    found = [name for name, given in cuts.items() if given]
-    require(
-        not found,
-        "mapping: cut",
-        expected="all rows of a stream, of which nothing is left out",
-        got=f"a cut by {found[0]}" if found else "",
-        remedy=REMEDY,
-    )
 
 
 def _same(found: list[Any], what: str, default: Any) -> Any:

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import require
-from retwin.data.layout import HEAD, text_layout
+from retwin.data.layout import HEAD, encoding_of, text_layout
 from retwin.data.layout import Layout as TextLayout
 from retwin.data.logs.arrow_tables import read_table
-from retwin.data.logs.channels import in_unit
+from retwin.data.logs.channels import in_unit, mean_of
 from retwin.data.logs.mapping import ChannelMapping
-from retwin.data.logs.signals import NANOSECOND, Clock, TimeUnit, named_unit
+from retwin.data.logs.signals import NANOSECOND, Clock, Signal, TimeUnit, named_unit
 from retwin.data.logs.units import same_unit
 from retwin.data.row_times import time_column, times_that_are
 from retwin.data.tables import Table, text_table
@@ -30,8 +30,6 @@ ROWS = 8192
 """Rows of a Parquet file that are converted at once."""
 TAIL = 256
 """Bytes before the place up to which a file was read that are compared before it is read on."""
-UTF16 = (b"\xff\xfe", b"\xfe\xff")
-"""Marks of an encoding in which the end of a row is not found by its bytes."""
 NEVER = -(2**63)
 """Time in ns of a command that was not measured yet."""
 
@@ -91,23 +89,24 @@ class Layout:
         """
         cells, unit, where = table.stamps(table.time_name(self.clock))
         times, kept, bad = times_that_are(cells, unit, self.clock, where)
-        found: dict[str, NDArray] = {}
-        good = np.zeros(table.rows, bool)
-        good[kept] = True
+        found: dict[str, Signal] = {}
+        every = np.arange(table.rows)
+        good = np.isin(every, kept)
         for name in self.signals:
-            found[name], odd = table.numbers(name)
+            numbers, odd = table.numbers(name)
             odd &= good
+            found[name] = Signal(name, every, numbers, table.units[name] if self.channels else "")
             if self.channels and odd.any():
                 bad.append(f"{odd.sum()} values of {name} in {table.place} that are no numbers")
             elif odd.any():
                 text = table.cells(name)[odd].tolist()
                 bad += [f"{str(each)[:80]!r} in {table.place}, column {name!r}" for each in text]
                 good &= ~odd
-        units = [[table.units[each] for each in own] for own in self.columns]
-        means = [np.mean([found[each] for each in own], axis=0) for own in self.columns]
-        for at, channel in enumerate(self.channels):
-            means[at] = _in_unit_of(channel, means[at], units[at], table.place)
-        values = np.stack(means, axis=1)[good]
+        means = [mean_of([found[each] for each in own], table.place) for own in self.columns]
+        columns = [each.values for each in means]
+        for at, (channel, mean) in enumerate(zip(self.channels, means, strict=False)):
+            columns[at] = _in_unit_of(channel, mean, table.place)
+        values = np.stack(columns, axis=1)[good]
         times = times[good[kept]] + self.offset
         self._mask(times, values, since)
         return Rows(times, np.where(np.isfinite(values), values, np.nan), bad, end)
@@ -127,23 +126,12 @@ class Layout:
 
 
 def _in_unit_of(
-    channel: tuple[str, ChannelMapping, str | None],
-    values: NDArray,
-    units: list[str],
-    place: str,
+    channel: tuple[str, ChannelMapping, str | None], signal: Signal, place: str
 ) -> NDArray:
-    """The mean (n,) of columns in some units as values of a channel of a mapping."""
+    """The mean (n,) of columns as values of a channel of a mapping."""
     name, own, unit = channel
     where = f"{place}, {own.signals[0]}"
-    other = next((each for each in units if not same_unit(each, units[0])), None)
-    require(
-        other is None,
-        where,
-        expected="one unit of all columns that are averaged",
-        got=f"{units[0] or 'none'} and {other or 'none'}",
-        remedy="map one of them alone",
-    )
-    made, target, _ = in_unit(values, own, units[0], unit, where)
+    made, target, _ = in_unit(signal.values, own, signal.unit, unit, where)
     require(
         unit is not None or own.unit or same_unit(target, "1"),
         where,
@@ -253,8 +241,10 @@ class Csv(GrowingTable):
     def _parsed(self, text: bytes, place: _Place) -> Rows | None:
         """Complete lines after a place; None if they hold no row yet."""
         layout, name = place.layout, self.path.name
-        encoding = layout.encoding if layout else _encoding(text)
-        lines = text.decode(encoding, "replace").removeprefix("\ufeff").split("\n")[:-1]
+        encoding = layout.encoding if layout else encoding_of(text)
+        if encoding == "utf-16":  # the end of a row is not found by its bytes
+            raise ValueError("text in UTF-16, whose rows are not found while it grows: write UTF-8")
+        lines = text.decode(encoding, "replace").split("\n")[:-1]
         if layout is None:
             layout = text_layout(lines[:HEAD], encoding, name, self.layout.wanted)
             lines = lines[layout.first :]
@@ -308,14 +298,3 @@ class Parquet(GrowingTable):
             yield own.rows(
                 Table(self.path.name, units, part.stop - begin, some.__getitem__), since, end
             )
-
-
-def _encoding(text: bytes) -> str:
-    """UTF-8, else the encoding of Western Windows."""
-    if text[:2] in UTF16:
-        raise ValueError("text in UTF-16, whose rows are not found while it grows: write UTF-8")
-    try:
-        text.decode("utf-8")
-    except UnicodeDecodeError:
-        return "latin-1"
-    return "utf-8"
