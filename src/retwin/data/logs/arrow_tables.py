@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import at_most, needs_extra
-from retwin.data.logs.signals import MAX_SIGNALS, UNWANTED, Clock, Signal, Skipped, named_unit
+from retwin.data.logs.signals import MAX_SIGNALS, Clock, Signal, Skipped, named_unit
 from retwin.data.row_times import time_column
 from retwin.data.tables import Table
 
@@ -24,28 +25,25 @@ MAX_ELEMENTS = 64
 
 def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
     """The signals of a table: its columns of numbers; see `data.logs.signals.Reader`."""
-    table, left_out = read_table(path, wanted, clock)
-    yield from (Skipped(name, UNWANTED) for name in left_out)
-    yield from table.signals(clock, wanted)
+    yield from read_table(path, wanted, clock).signals(clock, wanted)
 
 
-def read_table(path: Path, wanted: frozenset[str] | None, clock: Clock) -> tuple[Table, list[str]]:
-    """The columns that may be wanted, and the names of the others.
+def read_table(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Table:
+    """The columns that may be wanted; those that are not have no cells.
 
     Fields of structures are `column.field`, elements of lists of one length `column[0]`. The unit
-    is in the title, or in the metadata of the column under `unit`.
+    is in the title, or in the metadata of the column under `unit`. Titles that are alike but for
+    the unit are names as a whole.
     """
     arrow = needs_extra("pyarrow", "logs", "reads Parquet and Arrow")
     needs_extra("pyarrow.compute", "logs", "takes structures apart")
-    table, left_out = _table(path, arrow, wanted, clock)
+    table, names = _table(path, arrow, wanted, clock)
     columns: dict[str, Any] = {}
-    units: dict[str, str] = {}
+    units = dict.fromkeys((n for title, n in names.items() if title not in table.column_names), "")
     for field, column in zip(table.schema, table.columns, strict=True):
-        name, unit = named_unit(field.name)
-        name = field.name if name in columns else name
         about = field.metadata or {}
-        unit = unit or about.get(b"unit", b"").decode("utf-8", "replace")
-        for own, leaf in _leaves(arrow, name, column, 0):
+        unit = named_unit(field.name)[1] or about.get(b"unit", b"").decode("utf-8", "replace")
+        for own, leaf in _leaves(arrow, names[field.name], column, 0):
             columns[own], units[own] = leaf, unit
             remedy = "write those that are wanted to a file of their own"
             at_most(path.name, len(columns), MAX_SIGNALS, "columns", remedy=remedy)
@@ -69,31 +67,36 @@ def read_table(path: Path, wanted: frozenset[str] | None, clock: Clock) -> tuple
         for name, column in columns.items()
         if not any(getattr(arrow.types, each)(column.type) for each in numeric)
     }
-    return Table(path.name, units, table.num_rows, cells, others=others), left_out
+    return Table(path.name, units, table.num_rows, cells, others=others)
 
 
 def _table(
     path: Path, arrow: Any, wanted: frozenset[str] | None, clock: Clock
-) -> tuple[Any, list[str]]:
-    """The table with the columns that may be wanted, and the names of the others."""
+) -> tuple[Any, dict[str, str]]:
+    """The table with the columns that may be wanted, and the names of all by their titles."""
     if path.suffix.lower() == ".parquet":
         parquet = needs_extra("pyarrow.parquet", "logs", "reads Parquet")
         with parquet.ParquetFile(path) as file:
-            titles = {each: named_unit(each)[0] for each in file.schema_arrow.names}
-            if wanted is None:
-                return file.read(), []
+            found = _by_title(file.schema_arrow.names)
             # A wide file has many columns that a mapping does not name.
-            names = {clock.column or time_column(titles.values()), *wanted}
-            kept = [title for title, name in titles.items() if _names(name, names)]
-            others = [name for title, name in titles.items() if title not in kept]
-            return file.read(columns=kept), others
+            some = {clock.column or time_column(found.values()), *(wanted or ())}
+            kept = [t for t, name in found.items() if wanted is None or _names(name, some)]
+            return file.read(columns=kept), found
     with path.open("rb") as stream:
         if stream.read(6) in FILES or path.suffix.lower() == ".feather":
             feather = needs_extra("pyarrow.feather", "logs", "reads Feather")
-            return feather.read_table(path, memory_map=False), []
-        stream.seek(0)
-        with arrow.ipc.open_stream(stream) as batches:
-            return batches.read_all(), []
+            table = feather.read_table(path, memory_map=False)
+        else:
+            stream.seek(0)
+            with arrow.ipc.open_stream(stream) as batches:
+                table = batches.read_all()
+    return table, _by_title(table.column_names)
+
+
+def _by_title(titles: Sequence[str]) -> dict[str, str]:
+    names = {each: named_unit(each)[0] for each in titles}
+    several = Counter(names.values())
+    return {title: name if several[name] == 1 else title for title, name in names.items()}
 
 
 def _names(column: str, names: set[str]) -> bool:

@@ -69,44 +69,27 @@ def mapped_layout(
     commands = table_of(mapping.commands, inputs, "commands", stated=stated)
     measured = table_of(mapping.outputs, outputs, "outputs", stated=stated)
     every, cut, time = (*commands, *measured), mapping.cut, mapping.time
-    held = "another one for rows as they appear: it is held until the next row, which is not there"
-    missing = "another one for rows as they appear: what was not measured is missing"
-    whole = "all rows of a stream, of which nothing is left out"
-    for key, got, fine, expected in (
-        (
-            "rate",
-            mapping.rate,
-            mapping.rate is None or np.isclose(mapping.rate, rate, rtol=1e-6),
-            f"that of the twin, {rate:g} Hz, to which samples come",
-        ),
-        (
-            "time.rate",
-            time.rate,
-            time.rate is None,
-            "a column of times, since a file that is replaced starts again",
-        ),
-        ("cut.by", cut.by, cut.by in ("none", "gap"), whole),
-        ("cut.min_length", cut.min_length, cut.min_length is None, whole),
-        *(
-            (f"commands.{name}.resample", own.resample, own.resample != "linear", held)
-            for name, own, _ in commands
-        ),
-        *(
-            (f"outputs.{name}.resample", own.resample, own.resample != "hold", missing)
-            for name, own, _ in measured
-        ),
-        *(
-            (
-                f"clock_offset of {name}",
-                own.clock_offset,
-                own.clock_offset == every[0][1].clock_offset,
-                "the same for all channels, since a row of a stream has one time; MQTT and OPC UA "
-                "take channels with clocks of their own",
-            )
-            for name, own, _ in every
-        ),
-    ):
-        require(fine, f"mapping: {key}", expected=expected, got=got, remedy=REMEDY)
+
+    def refuse(wrong: bool, key: str, got: object, expected: str) -> None:
+        require(not wrong, f"mapping: {key}", expected=expected, got=got, remedy=REMEDY)
+
+    other_rate = mapping.rate is not None and not np.isclose(mapping.rate, rate, rtol=1e-6)
+    refuse(other_rate, "rate", mapping.rate, f"that of the twin, {rate:g} Hz, or none")
+    wanted = "a column of times, since a file that is replaced starts again"
+    refuse(time.rate is not None, "time.rate", time.rate, wanted)
+    wanted = "all rows of a stream, of which nothing is left out"
+    refuse(cut.by in ("trigger", "length"), "cut.by", cut.by, wanted)
+    refuse(cut.min_length is not None, "cut.min_length", cut.min_length, wanted)
+    for name, own, _ in commands:
+        wanted = "another one: it is held until the next row, which is not there yet"
+        refuse(own.resample == "linear", f"commands.{name}.resample", own.resample, wanted)
+    for name, own, _ in measured:
+        wanted = "another one for rows as they appear: what was not measured is missing"
+        refuse(own.resample == "hold", f"outputs.{name}.resample", own.resample, wanted)
+    offsets = sorted({own.clock_offset for _, own, _ in every})
+    wanted = "the same for all channels, since a row of a stream has one time; MQTT and OPC UA take"
+    wanted += " channels with clocks of their own"
+    refuse(len(offsets) > 1, "clock_offset", offsets, wanted)
     columns = tuple(tuple(own.signals) for _, own, _ in every)
     return Layout(time.column, time.unit, columns, time.format, every, len(commands))
 

@@ -277,7 +277,7 @@ class Parquet(GrowingTable):
     def _rows(self) -> Iterator[Rows]:
         own = self.layout
         names = {each: named_unit(each)[0] for each in own.wanted}
-        table, _ = read_table(self.path, frozenset([*names, *names.values()]), own.clock)
+        table = read_table(self.path, frozenset([*names, *names.values()]), own.clock)
         found = {each: each if each in table.units else plain for each, plain in names.items()}
         lacking = [each for each, name in found.items() if name not in table.units]
         if lacking:
