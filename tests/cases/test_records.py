@@ -125,6 +125,12 @@ def test_a_table_is_read_as_logs_are(tmp_path: Path) -> None:
     np.testing.assert_allclose(made.commands[0, :, 0], [0.5, 0.5, 1])
     assert made.mask[0, :, 0].tolist() == [True, False, True]
     np.testing.assert_allclose(made.observed[0, [0, 2], 0], [1, 3.25])
+    titles = "time [ms]\tin [V]\ta\tb (V)\nms\tV\tV\tV\n"
+    (tmp_path / "first.csv").write_text(titles + "0\t1\t2\t4\n0.1\ton\tNA\t4\n")
+    made = read(tmp_path)
+    assert made.commands.ravel().tolist() == [1, 1]
+    assert made.observed[0, 0, 0] == 3
+    assert made.mask[0, :, 0].tolist() == [True, False], "a row of units is no sample"
     rows = "in,a,b\n1,2,2\n,,\n3,4,4\n"
     (tmp_path / "rows.csv").write_text(rows)
     two = [Record(COLUMNS, rows=each) for each in ((2, 4), (0, 2))]

@@ -12,13 +12,16 @@ from pathlib import Path
 
 import jsonschema
 import numpy as np
+import pyarrow
 import pytest
 from log_files import BEGIN, COUNT, HEATER, RATE, SPEED, SPEEDS, TIMES, mcap, ros2_bag
+from pyarrow import parquet
 
 import retwin as rt
 from retwin.cases.twin_data import TwinData, log_case
 from retwin.data import Provenance, load, propose_mapping, read_mapping, save
 from retwin.data import tables as text_tables
+from retwin.data.logs import arrow_tables
 from retwin.data.logs.channels import in_order
 from retwin.data.logs.cutting import pieces
 from retwin.data.logs.mapped import mapped
@@ -172,6 +175,26 @@ def test_a_row_of_empty_cells_is_a_sample_where_rows_come_at_a_rate(
     for each, values in zip(signals, ([1, np.nan, 3], [5, np.nan, 7]), strict=True):
         np.testing.assert_array_equal(each.values, values)
         assert len(each.times) == 3
+
+
+def test_columns_that_differ_by_their_unit_are_named_as_a_whole(tmp_path: Path) -> None:
+    table = {"time": [0.0, 1.0], "T [K]": [280.0, 281.0], "T [°C]": [6.85, 7.85], "v [V]": [1, 2]}
+    parquet.write_table(pyarrow.table(table), tmp_path / "a.parquet")
+    for wanted in (None, frozenset(["T [K]", "T [°C]"])):
+        found = arrow_tables.read(tmp_path / "a.parquet", wanted, Clock())
+        values = {each.name: each.values[0] for each in found if isinstance(each, Signal)}
+        assert values.items() >= {"T [K]": 280.0, "T [°C]": 6.85}.items()
+
+
+def test_numbers_are_no_times_in_a_stated_format() -> None:
+    cells = np.array(["1700000000.123456789", "1700000000,2"])
+    assert row_times(cells, "", Clock(unit="s"), "a").tolist() == [
+        1_700_000_000_123_456_789,
+        1_700_000_000_200_000_000,
+    ]
+    for clock in (Clock(unit="iso"), Clock(format="%Y%m%d")):
+        with pytest.raises(InputError, match=r"expected times: .* got '20260101\.0'"):
+            row_times(np.array([20260101.0]), "", clock, "a")
 
 
 def test_a_gap_is_missing_and_never_bridged() -> None:

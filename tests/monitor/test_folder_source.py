@@ -68,6 +68,21 @@ def test_files_appear_and_grow_and_only_complete_rows_count(logs: Path) -> None:
     assert len(lines) == 1
 
 
+def test_a_table_without_a_mapping_is_read_as_logs_are(logs: Path) -> None:
+    """Separator, decimal comma and lines above the titles are found; units are not converted."""
+    lines: list[str] = []
+    gate = CollectingGate()
+    (logs / "a.csv").write_text("Export 7\n\nT1 [°C];time;heater\n")
+    with running(source(logs.parent, lines), gate):
+        time.sleep(0.1)
+        with (logs / "a.csv").open("a") as file:
+            file.write("20,5;1,5;1\n;;\n21;2,5;x\n22;3,5;on\n")
+        wait(lambda: len(seconds(gate)) == 2, lines)
+    assert seconds(gate) == [1.5, 3.5]
+    np.testing.assert_array_equal(gate.values("line1"), [[1, 20.5], [1, 22]])
+    assert "'x' in a.csv, column 'heater'" in lines[-1]
+
+
 def test_rows_that_cannot_be_read_are_counted_and_stop_nothing(logs: Path) -> None:
     lines: list[str] = []
     gate = CollectingGate()
