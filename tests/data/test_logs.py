@@ -7,7 +7,7 @@ import re
 import textwrap
 import tomllib
 from datetime import UTC, datetime, timedelta
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import jsonschema
@@ -180,8 +180,11 @@ def test_a_row_of_empty_cells_is_a_sample_where_rows_come_at_a_rate(
 def test_columns_that_differ_by_their_unit_are_named_as_a_whole(tmp_path: Path) -> None:
     table = {"time": [0.0, 1.0], "T [K]": [280.0, 281.0], "T [°C]": [6.85, 7.85], "v [V]": [1, 2]}
     parquet.write_table(pyarrow.table(table), tmp_path / "a.parquet")
-    for wanted in (None, frozenset(["T [K]", "T [°C]"])):
-        found = arrow_tables.read(tmp_path / "a.parquet", wanted, Clock())
+    text = "time,T [K],T [°C],v [V]\n0,280,6.85,1\n1,281,7.85,2\n"
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    readers = [(arrow_tables.read, "a.parquet"), (text_tables.read, "a.csv")]
+    for (read, name), wanted in product(readers, (None, frozenset(["T [K]", "T [°C]"]))):
+        found = read(tmp_path / name, wanted, Clock())
         values = {each.name: each.values[0] for each in found if isinstance(each, Signal)}
         assert values.items() >= {"T [K]": 280.0, "T [°C]": 6.85}.items()
 

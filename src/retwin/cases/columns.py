@@ -216,7 +216,10 @@ class ColumnRecords:
         )
         self._check_separate(*([record for _, record in each] for each in (calibration, test)))
         every = (*calibration, *test)
-        tables = {file: _table(file, [r for f, r in every if f == file]) for file, _ in every}
+        files = dict.fromkeys(file for file, _ in every)
+        tables = {
+            file: _table(file, [own for path, own in every if path == file]) for file in files
+        }
         sources = {file: Provenance(file.name, sha256(file)) for file in tables}
 
         def made(name: str, found: Sequence[tuple[Path, Record]]) -> Trajectories:
@@ -315,15 +318,16 @@ def _table(path: Path, records: Sequence[Record]) -> Table:
     """
     channels = dict.fromkeys(chain(*(each.every_column for each in records)))
     clocks = [each.clock.column for each in records if each.clock]
-    table = read_titled(path, list(dict.fromkeys([*channels, *clocks])))
-    columns = {name: table.cells(name) for name in table.units}
+    names = list(dict.fromkeys([*channels, *clocks]))
+    table = read_titled(path, names)
+    columns = {name: table.cells(name) for name in names}
     for name in channels:
         columns[name], bad = table.numbers(name)
         if bad.any():
             row = int(np.argmax(bad))
             raise InputError(
                 table.place,
-                expected=f"numbers in columns {', '.join(table.units)}",
+                expected=f"numbers in columns {', '.join(names)}",
                 got=f"{str(table.cells(name)[row])[:40]!r} in data row {row} of {name}",
                 remedy="correct that cell, or leave it empty where nothing was measured",
             )

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TextIO
 
 from retwin.checks import require
-from retwin.data.logs.signals import named_unit
+from retwin.data.logs.signals import named_units
 from retwin.errors import InputError, brief
 
 MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "?"})
@@ -149,7 +149,7 @@ def text_layout(
     """
     found = _by_titles(lines, place, wanted) if wanted else None
     separator, first, titles, units = found or _by_numbers(lines, place)
-    pairs = [named_unit(title.strip().lstrip("#").strip()) for title in titles]
+    pairs = named_units([title.strip().lstrip("#").strip() for title in titles])
     own = [cell.strip().strip("[]()") for cell in units] or [""] * len(pairs)
     names = [name or f"column{i + 1}" for i, (name, _) in enumerate(pairs)]
     seen: dict[str, int] = {}
@@ -187,7 +187,7 @@ def _by_titles(
         rows = [next(rows_of([line], separator, place), []) for line in lines]
         for at, row in enumerate(rows):
             plain = [cell.strip() for cell in row]
-            names = [named_unit(each.lstrip("#"))[0] for each in plain]
+            names = [name for name, _ in named_units([each.lstrip("#").strip() for each in plain])]
             if not {*plain, *names}.issuperset(wanted):
                 continue
             width = len(row) - (not plain[-1])

@@ -165,15 +165,12 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
         kept = names  # the column of times is found by its name
     # At a rate, a row without values is a sample too: without it, later ones would come earlier.
     even = bool(clock.rate or (clock.otherwise and not (clock.column or time_column(names))))
-    found = _read_columns(path, layout, kept, empty=even)
-    units = dict(zip(names, layout.units, strict=True))
-    table = Table(path.name, units, found.rows, found.cells, found.comma)
-    yield from table.signals(clock, wanted)
+    yield from _read_columns(path, layout, kept, empty=even).signals(clock, wanted)
 
 
 def text_table(place: str, layout: Layout, rows: int, cells: Mapping[str, NDArray]) -> Table:
     """A table with the cells (rows,) of some columns, by the names by which they are wanted."""
-    units = {name: layout.units[layout.column(name)] for name in cells}
+    units = {each: layout.units[layout.column(each)] for each in (*layout.names, *cells)}
     return Table(place, units, rows, cells.__getitem__, layout.separator != ",")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import at_most, needs_extra
-from retwin.data.logs.signals import MAX_SIGNALS, Clock, Signal, Skipped, named_unit
+from retwin.data.logs.signals import MAX_SIGNALS, Clock, Signal, Skipped, named_units
 from retwin.data.row_times import time_column
 from retwin.data.tables import Table
 
@@ -39,11 +38,12 @@ def read_table(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Table
     needs_extra("pyarrow.compute", "logs", "takes structures apart")
     table, names = _table(path, arrow, wanted, clock)
     columns: dict[str, Any] = {}
-    units = dict.fromkeys((n for title, n in names.items() if title not in table.column_names), "")
+    units = {n: unit for title, (n, unit) in names.items() if title not in table.column_names}
     for field, column in zip(table.schema, table.columns, strict=True):
         about = field.metadata or {}
-        unit = named_unit(field.name)[1] or about.get(b"unit", b"").decode("utf-8", "replace")
-        for own, leaf in _leaves(arrow, names[field.name], column, 0):
+        name, unit = names[field.name]
+        unit = unit or about.get(b"unit", b"").decode("utf-8", "replace")
+        for own, leaf in _leaves(arrow, name, column, 0):
             columns[own], units[own] = leaf, unit
             remedy = "write those that are wanted to a file of their own"
             at_most(path.name, len(columns), MAX_SIGNALS, "columns", remedy=remedy)
@@ -72,15 +72,16 @@ def read_table(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Table
 
 def _table(
     path: Path, arrow: Any, wanted: frozenset[str] | None, clock: Clock
-) -> tuple[Any, dict[str, str]]:
-    """The table with the columns that may be wanted, and the names of all by their titles."""
+) -> tuple[Any, dict[str, tuple[str, str]]]:
+    """The table with the columns that may be wanted; names and units of all by their titles."""
     if path.suffix.lower() == ".parquet":
         parquet = needs_extra("pyarrow.parquet", "logs", "reads Parquet")
         with parquet.ParquetFile(path) as file:
             found = _by_title(file.schema_arrow.names)
             # A wide file has many columns that a mapping does not name.
-            some = {clock.column or time_column(found.values()), *(wanted or ())}
-            kept = [t for t, name in found.items() if wanted is None or _names(name, some)]
+            names = [name for name, _ in found.values()]
+            some = {clock.column or time_column(names), *(wanted or ())}
+            kept = [t for t, (name, _) in found.items() if wanted is None or _names(name, some)]
             return file.read(columns=kept), found
     with path.open("rb") as stream:
         if stream.read(6) in FILES or path.suffix.lower() == ".feather":
@@ -93,10 +94,8 @@ def _table(
     return table, _by_title(table.column_names)
 
 
-def _by_title(titles: Sequence[str]) -> dict[str, str]:
-    names = {each: named_unit(each)[0] for each in titles}
-    several = Counter(names.values())
-    return {title: name if several[name] == 1 else title for title, name in names.items()}
+def _by_title(titles: Sequence[str]) -> dict[str, tuple[str, str]]:
+    return dict(zip(titles, named_units(titles), strict=True))
 
 
 def _names(column: str, names: set[str]) -> bool:

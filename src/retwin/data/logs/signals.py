@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -141,6 +142,16 @@ def named_unit(name: str) -> tuple[str, str]:
     if found is None or re.fullmatch(r"\d+|", unit := (found[2] or found[3] or "").strip()):
         return name.strip(), ""
     return found[1], unit
+
+
+def named_units(titles: Sequence[str]) -> list[tuple[str, str]]:
+    """Name and unit of each title; titles that are alike but for the unit are names as a whole."""
+    pairs = [named_unit(each) for each in titles]
+    several = Counter(name for name, _ in pairs)
+    return [
+        (title.strip() if several[name] > 1 else name, unit)
+        for title, (name, unit) in zip(titles, pairs, strict=True)
+    ]
 
 
 def nanoseconds(time: datetime) -> int:
