@@ -250,12 +250,12 @@ def _folders(
                 got=settings.files,
                 remedy="give tables of samples, since its monitor watches no whole trajectories",
             )
-            if mapping is None:
-                layouts[name] = layout_of(settings, live.channels(name), cases_[name])
-            else:
-                twin = monitor.twin
-                channels = (twin.inputs, twin.outputs, twin.rate)
-                layouts[name] = mapped_layout(mapping, *channels, cases_[name])
+            twin, case = monitor.twin, cases_[name]
+            layouts[name] = (
+                layout_of(settings, live.channels(name), case)
+                if mapping is None
+                else mapped_layout(mapping, twin.inputs, twin.outputs, twin.rate, case)
+            )
     made: list[Source] = []
     if layouts:
         made.append(Folder(settings, layouts, newest, report))

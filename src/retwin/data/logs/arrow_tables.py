@@ -50,11 +50,6 @@ def read_table(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Table
 
     def cells(name: str) -> NDArray:
         column, types = columns[name], arrow.types
-        if types.is_timestamp(column.type):
-            made = column.cast("timestamp[ns]", safe=False).cast("int64").to_numpy()
-            missing = np.isnan(made) if made.dtype.kind == "f" else np.zeros(len(made), bool)
-            whole = np.where(missing, 0, made).astype("datetime64[ns]")
-            return np.where(missing, np.datetime64("NaT"), whole)
         if types.is_boolean(column.type):
             column = column.cast("int8")
         elif types.is_decimal(column.type):

@@ -192,8 +192,6 @@ def _frames(path: Path, request: dict[str, Any], budget: Budget) -> Iterator[Sig
                     raise _ended(path, process)
                 if "done" in about:
                     return
-                if "begun" in about:
-                    continue
                 yield _received(path, about, process, budget)
         finally:
             process.kill()

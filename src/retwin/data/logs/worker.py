@@ -11,7 +11,6 @@ import json
 import os
 import struct
 import sys
-import time
 import warnings
 from contextlib import suppress
 from pathlib import Path
@@ -60,7 +59,6 @@ def main() -> None:
 def _read(path: Path, request: dict[str, Any], out: BinaryIO) -> None:
     read = resolve(LOGS[request["format"]].reader)
     wanted = None if request["wanted"] is None else frozenset(request["wanted"])
-    _send(out, {"begun": time.time()})
     for each in read(path, wanted, Clock(**request["clock"])):
         if not isinstance(each, Signal):
             _send(out, {"skipped": each.name, "reason": each.reason})
