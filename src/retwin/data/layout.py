@@ -75,7 +75,8 @@ class Layout:
 
     def column(self, name: str) -> int:
         """Where a column is, by its whole title or its name; ValueError if it is nowhere."""
-        return (self.titles if name in self.titles else self.names).index(name)
+        plain = name.strip()
+        return (self.titles if plain in self.titles else self.names).index(plain)
 
 
 def begin_of(path: Path) -> tuple[list[str], str]:
@@ -147,6 +148,7 @@ def text_layout(
         No row has the titles or numbers.
 
     """
+    wanted = [each.strip() for each in wanted]
     found = _by_titles(lines, place, wanted) if wanted else None
     separator, first, titles, units = found or _by_numbers(lines, place)
     pairs = named_units([title.strip().lstrip("#").strip() for title in titles])
