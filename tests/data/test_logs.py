@@ -26,8 +26,9 @@ from retwin.data.logs.channels import in_order
 from retwin.data.logs.cutting import pieces
 from retwin.data.logs.mapped import mapped
 from retwin.data.logs.mapping import Cut, Mapping
+from retwin.data.logs.messages import Series, Types
 from retwin.data.logs.reading import read_log
-from retwin.data.logs.signals import Clock, Log, Signal, named_unit
+from retwin.data.logs.signals import Clock, Log, Signal, Skipped, named_unit
 from retwin.data.logs.units import compatible, converted
 from retwin.data.resampling import resampled
 from retwin.data.row_times import row_times
@@ -94,6 +95,24 @@ def test_joints_are_found_by_their_names_in_any_order(tmp_path: Path) -> None:
     assert "protobuf" in found.skipped["/camera"]
     assert found.begin == BEGIN
     assert not any("header.stamp" in name for name in found.signals)
+
+
+@pytest.mark.parametrize("name", ["a/msg/Unknown", "a/msg/Holder"])
+def test_messages_of_unknown_types_are_skipped_with_the_reason(name: str) -> None:
+    """Of the type itself, or of one inside it; the second message is not tried."""
+    types, series = Types(), Series(None, Clock())
+    types.define("a/msg/Holder", "Unknown inner\nfloat64 level")
+    tries = []
+
+    def decode() -> object:
+        tries.append(name)
+        return types.decode(bytes(40), name)
+
+    for recorded in range(2):
+        series.add("/a", name, recorded, decode)
+    (skipped,) = series.found()
+    assert skipped == Skipped("/a", f"messages of the type {name}, which the log does not define")
+    assert len(tries) == 1
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import at_most, needs_extra
-from retwin.data.logs.signals import MAX_SIGNALS, Clock, Signal, Skipped, named_units
+from retwin.data.logs.signals import MAX_SIGNALS, Clock, Signal, Skipped, inside, named_units
 from retwin.data.row_times import time_column
 from retwin.data.tables import Table
 
@@ -76,7 +76,11 @@ def _table(
             # A wide file has many columns that a mapping does not name.
             names = [name for name, _ in found.values()]
             some = {clock.column or time_column(names), *(wanted or ())}
-            kept = [t for t, (name, _) in found.items() if wanted is None or _names(name, some)]
+            kept = [
+                title
+                for title, (name, _) in found.items()
+                if wanted is None or any(inside(each, name) for each in some)
+            ]
             return file.read(columns=kept), found
     with path.open("rb") as stream:
         if stream.read(6) in FILES or path.suffix.lower() == ".feather":
@@ -91,11 +95,6 @@ def _table(
 
 def _by_title(titles: Sequence[str]) -> dict[str, tuple[str, str]]:
     return dict(zip(titles, named_units(titles), strict=True))
-
-
-def _names(column: str, names: set[str]) -> bool:
-    """Whether one of the names is that column, or something inside it."""
-    return any(n == column or n.startswith((f"{column}.", f"{column}[")) for n in names)
 
 
 def _leaves(arrow: Any, name: str, column: Any, depth: int) -> Iterator[tuple[str, Any]]:

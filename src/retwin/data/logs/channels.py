@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import require, same_names
 from retwin.data.logs.mapping import ChannelMapping
-from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Log, Signal
+from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Log, Signal, inside
 from retwin.data.logs.units import converted, same_unit
 from retwin.data.measured import stand_in
 from retwin.data.provenance import Sampling
@@ -153,9 +153,7 @@ def _channel(
             "write NaN, if they stand for missing ones"
         )
     topics = [topic for topic, why in log.skipped.items() if why == NO_STAMP]
-    if any(
-        signal.name == each or signal.name.startswith((f"{each}.", f"{each}[")) for each in topics
-    ):
+    if any(inside(signal.name, each) for each in topics):
         notes.append("no header stamps, time of recording")
     values, target, done = in_unit(
         signal.values, own, signal.unit, unit, f"{log.name}, {signal.name}"

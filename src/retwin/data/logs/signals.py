@@ -144,6 +144,11 @@ def named_unit(name: str) -> tuple[str, str]:
     return found[1], unit
 
 
+def inside(name: str, outer: str) -> bool:
+    """Whether a signal is a topic or a column, or a field or an element of it."""
+    return name == outer or name.startswith((f"{outer}.", f"{outer}["))
+
+
 def named_units(titles: Sequence[str]) -> list[tuple[str, str]]:
     """Name and unit of each title; titles that are alike but for the unit are names as a whole."""
     pairs = [named_unit(each) for each in titles]
