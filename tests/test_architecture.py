@@ -30,6 +30,7 @@ ROOMS = (
         "compiler",
         "processes",
         "isolation",
+        "workers",
         "jobs",
         "serialisation",
         "entries",

@@ -219,8 +219,9 @@ def test_a_library_that_crashes_ends_with_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from retwin.data.logs import reading
+    from retwin.workers import reader
 
-    monkeypatch.setattr(reading, "CODE", "import os; os.abort()  # {path}")
+    monkeypatch.setattr(reader, "CODE", "import os; os.abort()  # {path}")
     monkeypatch.setattr(reading, "SAFE", 0)  # small tables of text are read here
     csv(tmp_path / "a.csv")
     refused(tmp_path / "a.csv", r"the format's library failed \(signal 6\)")
