@@ -29,7 +29,6 @@ ROOMS = (
         "threads",
         "compiler",
         "processes",
-        "isolation",
         "workers",
         "jobs",
         "serialisation",

@@ -5,19 +5,17 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 
 @pytest.mark.slow
-def test_the_command(tmp_path: Path) -> None:
-    words = ["bench", "--n", "18", "--repeats", "1", "--json", "--out", tmp_path / "a.json"]
+def test_the_command() -> None:
+    words = ["bench", "--n", "18", "--repeats", "1", "--json"]
     done = subprocess.run(
         [sys.executable, "-m", "retwin", *words], check=True, capture_output=True, text=True
     )
     figures = json.loads(done.stdout)
-    assert figures == json.loads((tmp_path / "a.json").read_text("utf-8"))
     assert figures.pop("trajectories") == 18
     ways: dict[str, dict[str, float]] = figures
     assert list(ways) == [

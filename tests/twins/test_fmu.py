@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import pickle
 import platform
@@ -365,7 +364,7 @@ def test_native_code_stays_out_of_this_process_and_off_the_disk(
         )
     assert seen == [1, 1]
     assert not list(tmp_path.iterdir())
-    assert not multiprocessing.active_children()
+    assert not psutil.Process().children()
     if sys.platform == "linux":
         assert "Lag.so" not in Path("/proc/self/maps").read_text("utf-8")
 
@@ -442,17 +441,13 @@ def test_an_fmu_that_does_not_load_is_refused_once(tmp_path: Path, load: int, wh
         twin.simulate(np.zeros((3, 10, 1)), seed=0)
 
 
-def test_a_script_without_a_guard_is_advised(lag: Path, tmp_path: Path) -> None:
+def test_a_script_needs_no_guard(lag: Path, tmp_path: Path) -> None:
     text = SCRIPT.split("if __name__")[0] + (
         f"twin = FMUTwin.from_file({str(lag)!r}, 100.0, ['u'], ['x'], workers=1)\n"
         "twin.simulate(np.zeros((1, 10, 1)), seed=0)\n"
     )
     (tmp_path / "main.py").write_text(text)
-    ran = subprocess.run(
-        [sys.executable, tmp_path / "main.py"], capture_output=True, text=True, timeout=120
-    )
-    assert ran.returncode == 1
-    assert "in a script simulate under `if __name__ == '__main__':`" in ran.stderr
+    subprocess.run([sys.executable, tmp_path / "main.py"], check=True, timeout=120)
 
 
 def test_members_stay_in_the_folder(
@@ -548,7 +543,7 @@ def test_ten_thousand_runs_do_not_grow_the_worker(lag: Path, log: Path) -> None:
     memory: list[float] = []
 
     def measure(share: float) -> None:
-        for child in multiprocessing.active_children():
+        for child in psutil.Process().children():
             pages = int(Path(f"/proc/{child.pid}/statm").read_text("utf-8").split()[1])
             memory.append(pages * 4096 / 2**20)
 

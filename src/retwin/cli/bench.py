@@ -11,15 +11,12 @@ import timeit
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import retwin as rt
 from retwin.cli.options import Json, option
-from retwin.cli.terminal import answer, bar, note, table
+from retwin.cli.terminal import answer, bar, table
 from retwin.data.trajectories import HEALTHY
-from retwin.serialisation.files import write_json
-from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
@@ -32,7 +29,6 @@ MAX_COUNT, MAX_REPEATS = 10**7, 1000
 
 
 def bench(
-    out: Annotated[Path | None, option("FILE", "JSON file for the figures, too.")] = None,
     n: Annotated[
         int, option("N", "Trajectories that times are given for.", "--n", min=9, max=MAX_COUNT)
     ] = 3600,
@@ -42,33 +38,26 @@ def bench(
     as_json: Json = False,
 ) -> None:
     """Time twins of the arm, beside the paper."""
-    if out is not None:
-        check_place(out)
     case = rt.cases.get("armpi")
-    times: dict[str, float] = {}
-    titles: dict[str, str] = {}
+    figures: dict[str, dict[str, Any]] = {}
     with bar("bench") as show:
         show("learning", 0.0)
-        for name, titles[name], twin, share in _ways(case):
-            show(titles[name], 0.4 + 0.1 * len(times))
+        for name, what, twin, share in _ways(case):
+            show(what, 0.4 + 0.1 * len(figures))
             per_class = max(1, round(share * n / len(case.classes)))
             make = partial(rt.generate, twin, case, per_class=per_class, seed=2)
-            seconds = median_seconds(make, repeats)
-            times[name] = seconds * n / (per_class * len(case.classes))
-    kept = {
-        name: (titles[name], seconds, seconds / times["corrected"], PAPER.get(name))
-        for name, seconds in times.items()
-    }
-    keys = ("what", "seconds", "ratio", "paper")
-    figures = {name: dict(zip(keys, each, strict=True)) for name, each in kept.items()}
-    if out is not None:
-        write_json(out, {"trajectories": n, **figures})
-    rows = [[what, *(f"{x:.3g}" if x else "" for x in some)] for what, *some in kept.values()]
-    numbers = ("s", "ratio", "paper, s")
-    shown = table((f"{n} labelled trajectories of 10 s", *numbers), rows, numbers=numbers)
+            seconds = median_seconds(make, repeats) * n / (per_class * len(case.classes))
+            figures[name] = {"what": what, "seconds": seconds}
+    for name, each in figures.items():
+        ratio = each["seconds"] / figures["corrected"]["seconds"]
+        each.update(ratio=ratio, paper=PAPER.get(name))
+    rows = [
+        [what, *(f"{x:.3g}" if x else "" for x in numbers)]
+        for what, *numbers in (each.values() for each in figures.values())
+    ]
+    titles = ("s", "ratio", "paper, s")
+    shown = table((f"{n} labelled trajectories of 10 s", *titles), rows, numbers=titles)
     answer({"trajectories": n, **figures}, shown, as_json=as_json)
-    if out is not None:
-        note(f"Wrote {out}")
 
 
 def _ways(case: Case) -> Iterator[tuple[str, str, Twin, float]]:

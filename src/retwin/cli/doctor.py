@@ -12,7 +12,6 @@ import platform
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, TypeAlias
@@ -40,30 +39,8 @@ elif torch.accelerator.is_available(): print(torch.accelerator.current_accelerat
 else: print("none that torch can use, and none is needed")"""
 
 Found: TypeAlias = tuple[str, str, str, str]
-"""A `Check` whose state holds where its remedy is not empty; it is "ok" otherwise."""
-
-
-@dataclass(frozen=True)
-class Check:
-    """The result of one check.
-
-    Attributes
-    ----------
-    name : str
-        What was checked.
-    state : {"ok", "warning", "missing", "broken"}
-        As it should be; works with a drawback; absent and optional; absent and required.
-    found : str
-        What was found, in words.
-    remedy : str
-        What to do; "" if nothing is needed.
-
-    """
-
-    name: str
-    state: str
-    found: str
-    remedy: str = ""
+"""A check: what is checked; its state where something has to be done, which is "warning", "missing"
+for what is optional or "broken"; what was found; and what has to be done, "" for nothing."""
 
 
 def doctor(
@@ -74,13 +51,12 @@ def doctor(
 ) -> None:
     """Check installation, machine and data, and name what is missing."""
     checks = [
-        Check(name, state if remedy else "ok", found, remedy)
-        for part in (_installation(deep), _machine(deep), _data())
-        for name, state, found, remedy in part
+        {"name": name, "state": state if remedy else "ok", "found": found, "remedy": remedy}
+        for name, state, found, remedy in (*_installation(deep), *_machine(deep), *_data())
     ]
-    broken = ", ".join(each.name for each in checks if each.state == "broken")
+    broken = ", ".join(each["name"] for each in checks if each["state"] == "broken")
     rows = [
-        (each.state, each.name, each.found + (f"\n→ {each.remedy}" if each.remedy else ""))
+        (each["state"], each["name"], "\n→ ".join(filter(None, (each["found"], each["remedy"]))))
         for each in checks
     ]
     shown = f"broken: {broken}; retwin cannot work like this."

@@ -1,5 +1,5 @@
-"""Work outside of the main thread: threads, processes, a Dask cluster, and what may crash.
+"""Processes for native code of others, which may crash, hang or take all memory.
 
-Belongs here: pools, their time limits and their end with the program, and the process in which the
-libraries of foreign files run. Not here: what is computed there.
+Belongs here: such a process and its limits, pools of them, and the reading of files in one. Not
+here: the pools of retwin's own work (see `processes`), and what is computed there.
 """

@@ -20,9 +20,9 @@ from retwin.errors import InputError, brief
 from retwin.progress import Progress, tracked
 from retwin.serialisation.files import sha256
 from retwin.serialisation.sizes import Budget
-from retwin.workers.reader import ReaderProcess
+from retwin.workers.reader import FileReader
 
-Reader = Callable[[Path, str, "DataCase | None", Budget, ReaderProcess], Raw]
+Reader = Callable[[Path, str, "DataCase | None", Budget, FileReader], Raw]
 COORDINATES = 3
 """Outputs per sample in the arm's authors' files: x, y and z."""
 VARIABLES = ("trajCmds", "trajResps", "dataset", "motorCmdsRadius")
@@ -103,9 +103,7 @@ def _in_order(path: Path, pattern: str) -> list[Path]:
     return sorted(files, key=key)
 
 
-def _read_csv(
-    file: Path, where: str, case: DataCase | None, budget: Budget, _: ReaderProcess
-) -> Raw:
+def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget, _: FileReader) -> Raw:
     with file.open("rb") as blocks:
         for part in iter(lambda: blocks.read(BYTES_PER_BLOCK), b""):
             numbers = 1 + part.count(b",") + part.count(b"\n")
@@ -154,7 +152,7 @@ def _is_number(field: str) -> bool:
 
 
 def _read_dataset(
-    file: Path, where: str, case: DataCase | None, budget: Budget, reader: ReaderProcess
+    file: Path, where: str, case: DataCase | None, budget: Budget, reader: FileReader
 ) -> Raw:
     width = len(case.outputs) if case is not None else COORDINATES
     paths = mat_variables(file, budget, reader, VARIABLES)

@@ -15,7 +15,8 @@ from retwin.data.trajectories import Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.serialisation.files import check_regular, sha256
 from retwin.serialisation.sizes import Budget
-from retwin.workers.reader import Frame, ReaderProcess
+from retwin.workers.process import Frame
+from retwin.workers.reader import FileReader
 
 PAIRS = (("X_array", "y_array"), ("X_test_array", "y_test_array"))
 """The names of the variables that hold trajectories and class names."""
@@ -72,16 +73,16 @@ def read_mat(
     return assemble(raws, source=source, case=case, rate=rate, budget=budget)
 
 
-def mat_reader() -> ReaderProcess:
+def mat_reader() -> FileReader:
     """A process that reads MAT files, since scipy trusts the sizes in them: one flipped bit may
     end its process.
     """
     task = f"{__name__}:send_variables"
-    return ReaderProcess(task, expected="a readable MAT file", remedy="get the file again")
+    return FileReader(task, expected="a readable MAT file", remedy="get the file again")
 
 
 def mat_variables(
-    path: Path, budget: Budget, reader: ReaderProcess, names: Sequence[str] | None = None
+    path: Path, budget: Budget, reader: FileReader, names: Sequence[str] | None = None
 ) -> dict[str, Any]:
     """The variables of a MAT file (those in `names`).
 

@@ -12,16 +12,14 @@ from retwin.catalog import LOGS, resolve
 from retwin.checks import at_most, require
 from retwin.data.logs import text_tables
 from retwin.data.logs.signals import MAX_SIGNALS, NANOSECOND, Clock, Log, Signal
-from retwin.errors import InputError, brief
 from retwin.progress import Progress
-from retwin.serialisation.files import sha256
+from retwin.serialisation.files import refusing, sha256
 from retwin.serialisation.sizes import Budget
-from retwin.workers.reader import Frame, ReaderProcess
+from retwin.workers.process import Frame
+from retwin.workers.reader import FileReader
 
 BAG = "metadata.yaml"
 """The file that every ROS 2 bag has."""
-BYTES_PER_VALUE = 16
-"""Bytes of a time and a value."""
 WHOLE = "a log that is whole"
 DAMAGED = "get or make the file again, or repair it with the tools of its format"
 SAFE = 2**24
@@ -97,19 +95,20 @@ def read_log(
         "format": kind,
         "wanted": None if wanted is None else sorted(wanted),
         "clock": asdict(clock or Clock()),
-        "max_bytes": budget.left,
-        "size": size,
     }
     signals: dict[str, Signal] = {}
     skipped: dict[str, str] = {}
-    here = size <= SAFE and resolve(LOGS[kind].reader) is text_tables.read
-    for each in (_read_here if here else _read_apart)(path, request, budget):
-        if isinstance(each, Signal):
-            signals[each.name] = each
-            if progress is not None and wanted:
-                progress(len(signals) / len(wanted))
-        else:
-            skipped[each[0]] = each[1]
+    for count, (about, arrays) in enumerate(_frames(path, request, size, budget), 1):
+        remedy = "name those that are wanted in the mapping"
+        at_most(path.name, count, MAX_SIGNALS, "signals", remedy=remedy)
+        if not arrays:
+            skipped[str(about[0])] = str(about[1])
+            continue
+        times, values = arrays
+        name, unit, unreadable = str(about[0]), str(about[1]), int(about[2])
+        signals[name] = Signal(name, times, values, unit, unreadable)
+        if progress is not None and wanted:
+            progress(len(signals) / len(wanted))
     require(
         signals or wanted is not None,  # what is missing then is named with what is alike
         path.name,
@@ -123,28 +122,6 @@ def read_log(
         for name, each in signals.items()
     }
     return Log(path.resolve().name, sha256(path), begin, shifted, skipped)
-
-
-def _read_here(
-    path: Path, request: dict[str, Any], budget: Budget
-) -> Iterator[Signal | tuple[str, str]]:
-    """What the reader of a small table of text finds, with the limits of the other way."""
-    wanted = None if request["wanted"] is None else frozenset(request["wanted"])
-    count = 0
-    try:
-        for each in text_tables.read(path, wanted, Clock(**request["clock"])):
-            count += 1
-            if count > MAX_SIGNALS:
-                raise _refused(path, "more signals than can be")
-            if isinstance(each, Signal):
-                budget.take(BYTES_PER_VALUE * len(each.times))
-                yield each
-            else:
-                yield each.name, each.reason
-    except InputError:
-        raise
-    except Exception as error:
-        raise _refused(path, f"{type(error).__name__}: {brief(error)}") from None
 
 
 def _files(path: Path) -> list[Path]:
@@ -161,37 +138,27 @@ def _files(path: Path) -> list[Path]:
     return files
 
 
-def _read_apart(
-    path: Path, request: dict[str, Any], budget: Budget
-) -> Iterator[Signal | tuple[str, str]]:
-    """What the process that reads the log sends."""
+def _frames(path: Path, request: dict[str, Any], size: int, budget: Budget) -> Iterator[Frame]:
+    """What `send_signals` yields, in a process with limits."""
+    reader = resolve(LOGS[request["format"]].reader)
+    if size <= SAFE and reader is text_tables.read:
+        with refusing(path.name, expected=WHOLE, remedy=DAMAGED):
+            for about, arrays in send_signals(request):
+                budget.take(sum(each.nbytes for each in arrays))
+                yield about, arrays
+        return
     task = f"{__name__}:send_signals"
-    size = request["size"]
-    with ReaderProcess(task, expected=WHOLE, remedy=DAMAGED) as process:
-        for count, (about, arrays) in enumerate(process.read(request, path.name, size, budget), 1):
-            if count > MAX_SIGNALS:
-                raise _refused(path, "more signals than can be")
-            if arrays:
-                times, values = arrays
-                yield Signal(str(about[0]), times, values, str(about[1]), int(about[2]))
-            else:
-                yield str(about[0]), str(about[1])
+    with FileReader(task, expected=WHOLE, remedy=DAMAGED) as process:
+        yield from process.read(request, path.name, size, budget)
 
 
 def send_signals(request: dict[str, Any]) -> Iterator[Frame]:
     """The task of the process that reads a log: signals with their arrays, or what it skipped."""
     read = resolve(LOGS[request["format"]].reader)
-    path = Path(request["path"])
     wanted = None if request["wanted"] is None else frozenset(request["wanted"])
-    remedy = "name those that are wanted in the mapping"
-    for count, each in enumerate(read(path, wanted, Clock(**request["clock"])), 1):
-        at_most(path.name, count, MAX_SIGNALS, "signals", remedy=remedy)
+    for each in read(Path(request["path"]), wanted, Clock(**request["clock"])):
         if isinstance(each, Signal):
             arrays = [each.times.astype("<i8", copy=False), each.values.astype("<f8", copy=False)]
             yield (each.name, each.unit, each.unreadable), arrays
         else:
             yield (each.name, each.reason), []
-
-
-def _refused(path: Path, got: str) -> InputError:
-    return InputError(path.name, expected=WHOLE, got=got, remedy=DAMAGED)
