@@ -21,7 +21,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import positive, require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.processes import scratch_folder
 from retwin.progress import Progress
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
@@ -39,6 +38,7 @@ from retwin.twins.time_step import steps_per_sample
 from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks
 from retwin.twins.workers import worker_processes
 from retwin.workers.isolation import IsolatedPool
+from retwin.workers.pools import scratch_folder
 from retwin.workers.process import Frame, ProcessEnded
 
 TRAJECTORIES_PER_CHUNK = 256

@@ -17,13 +17,13 @@ from pebble import ProcessExpired, ProcessPool
 from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
-from retwin.processes import check_sendable, sendable_errors, worker_pool
 from retwin.progress import Progress
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, simulate_in_chunks
 from retwin.twins.workers import worker_processes
+from retwin.workers.pools import check_sendable, sendable_errors, worker_pool
 
 TRAJECTORIES_PER_CHUNK = 128
 """Number of trajectories that a vectorised function gets at once."""

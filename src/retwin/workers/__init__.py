@@ -1,5 +1,5 @@
-"""Processes for native code of others, which may crash, hang or take all memory.
+"""Work outside of the main thread: in threads, in processes, on a Dask cluster.
 
-Belongs here: such a process and its limits, pools of them, and the reading of files in one. Not
-here: the pools of retwin's own work (see `processes`), and what is computed there.
+Belongs here: pools, their limits and their end with the program, and the processes of native code
+that may crash, hang or take all memory. Not here: what is computed there.
 """

@@ -12,8 +12,8 @@ from contextlib import ExitStack
 from typing import Any
 
 from retwin.errors import InputError
-from retwin.processes import scratch_folder
 from retwin.serialisation.sizes import Budget
+from retwin.workers.pools import scratch_folder
 from retwin.workers.process import ForeignProcess, Frame, ProcessEnded
 
 

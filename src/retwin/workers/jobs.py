@@ -18,8 +18,8 @@ from pebble import ProcessExpired
 from retwin.checks import needs_extra
 from retwin.errors import InputError
 from retwin.modules import add_known, known
-from retwin.processes import check_sendable, sendable_errors, worker_pool
 from retwin.progress import Progress
+from retwin.workers.pools import check_sendable, sendable_errors, worker_pool
 
 ATTEMPTS = 3
 """How often a chunk is begun while worker processes die, before that is an error."""
