@@ -113,7 +113,7 @@ class ForeignProcess:
         arrays: Sequence[NDArray] = (),
         *,
         take: Callable[[int], None],
-        timeout: float | None = None,
+        timeout: float = threading.TIMEOUT_MAX,
         limits: tuple[int, int] | None = None,
     ) -> Iterator[Frame]:
         """What a task yields; when it is done, the process can have another one.
@@ -128,7 +128,7 @@ class ForeignProcess:
             Arrays of numbers.
         take : callable
             Called with the bytes of an answer before they are allocated; may raise an exception.
-        timeout : float, optional
+        timeout : float
             Duration in s after which the process is killed.
         limits : tuple of int, optional
             The memory that the task may take, and the size of its file, by which its processor time
@@ -175,15 +175,14 @@ class ForeignProcess:
         finally:
             timer.cancel()
 
-    def _timer(self, timeout: float | None) -> threading.Timer:
+    def _timer(self, timeout: float) -> threading.Timer:
         def end() -> None:
             self._late = True
             self.kill()
 
-        timer = threading.Timer(timeout or 0.0, end)
+        timer = threading.Timer(timeout, end)
         timer.daemon = True
-        if timeout is not None:
-            timer.start()
+        timer.start()
         return timer
 
     def _ended(self) -> ProcessEnded:
