@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.io.assembly import DataCase, Raw, assemble
-from retwin.data.io.mat import mat_variables, matrix
-from retwin.data.io.mat5 import Opaque
+from retwin.data.io.mat import mat_reader, mat_variables, matrix
 from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress, tracked
 from retwin.serialisation.files import sha256
 from retwin.serialisation.sizes import Budget
+from retwin.workers.reader import FileReader
 
-Reader = Callable[[Path, str, "DataCase | None", Budget], Raw]
+Reader = Callable[[Path, str, "DataCase | None", Budget, FileReader], Raw]
 COORDINATES = 3
 """Outputs per sample in the arm's authors' files: x, y and z."""
 VARIABLES = ("trajCmds", "trajResps", "dataset", "motorCmdsRadius")
@@ -68,16 +68,17 @@ def read_class_folders(
     )
     files, read = found[0]
     raws, budget = [], Budget(path.name, max_bytes)
-    for file in tracked(files, len(files), progress):
-        where = f"{file.parent.name}/{file.name}"
-        require(
-            file.is_file(),
-            where,
-            expected="a regular file",
-            got="a pipe, a device or a folder",
-            remedy="keep nothing else of that name there",
-        )
-        raws.append(read(file, where, case, budget))
+    with mat_reader() as reader:
+        for file in tracked(files, len(files), progress):
+            where = f"{file.parent.name}/{file.name}"
+            require(
+                file.is_file(),
+                where,
+                expected="a regular file",
+                got="a pipe, a device or a folder",
+                remedy="keep nothing else of that name there",
+            )
+            raws.append(read(file, where, case, budget, reader))
     raws, inputs = _commands_of_case(raws, case, radians=read is _read_dataset)
     return assemble(
         raws,
@@ -102,7 +103,7 @@ def _in_order(path: Path, pattern: str) -> list[Path]:
     return sorted(files, key=key)
 
 
-def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget) -> Raw:
+def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget, _: FileReader) -> Raw:
     with file.open("rb") as blocks:
         for part in iter(lambda: blocks.read(BYTES_PER_BLOCK), b""):
             numbers = 1 + part.count(b",") + part.count(b"\n")
@@ -134,9 +135,11 @@ def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget) -> 
     return Raw.of_columns(block, where, case, label, f"{label}/{file.stem}")
 
 
-def _read_dataset(file: Path, where: str, case: DataCase | None, budget: Budget) -> Raw:
+def _read_dataset(
+    file: Path, where: str, case: DataCase | None, budget: Budget, reader: FileReader
+) -> Raw:
     width = len(case.outputs) if case is not None else COORDINATES
-    paths = mat_variables(file, budget, VARIABLES)
+    paths = mat_variables(file, budget, reader, VARIABLES)
     if {"trajCmds", "trajResps"} <= set(paths):
         nominal = _upright(paths["trajCmds"], width, f"{where}: trajCmds")
         observed = _upright(paths["trajResps"], width, f"{where}: trajResps")
@@ -149,7 +152,7 @@ def _read_dataset(file: Path, where: str, case: DataCase | None, budget: Budget)
         raise InputError(
             where,
             expected="the variables trajCmds and trajResps, or dataset",
-            got=", ".join(sorted(mat_variables(file, budget))) or "none",
+            got=", ".join(sorted(mat_variables(file, budget, reader))) or "none",
             remedy="give the folder of the authors' data as it is",
         )
     require(
@@ -182,7 +185,7 @@ def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None,
     A table of numbers, or a cell per motor with a vector or with a struct of `Data` and `Time`.
     """
     where = f"{where}: motorCmdsRadius"
-    if value is None or isinstance(value, Opaque):
+    if value is None:
         return None, None
     cells = np.asarray(value)
     if cells.dtype != object:
@@ -211,7 +214,7 @@ def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None,
 
 def _series(cell: Any, where: str) -> tuple[NDArray | None, float | None]:
     """Values (T,) and sample rate (Hz) of one motor; None for what cannot be decoded."""
-    if isinstance(cell, Opaque):
+    if cell is None:
         return None, None
     data = _vector(cell.get("Data") if isinstance(cell, dict) else cell, where)
     if not isinstance(cell, dict) or "Time" not in cell:
