@@ -243,5 +243,13 @@ def test_without_a_method_the_records_decide(folder: Path, tmp_path: Path, call)
     assert head == "record,time,level_measured,level_mean,level_q05,level_q95"
     low, mean, high = (float(first.split(",")[i]) for i in (4, 3, 5))
     assert low < mean < high
+    alone, given = tmp_path / "alone.csv", rt.load(other)
+    rows = [f"{t / given.rate},{u:.9g}" for t, u in enumerate(given.commands[0, :, 0])]
+    alone.write_text("\n".join([f"time [s],{given.inputs.names[0]}", *rows]) + "\n")
+    again = tmp_path / "again.csv"
+    code, _, err = call("generate", out, "--commands", alone, "--bands", "--out", again)
+    assert code == 0, err
+    cells = again.read_text().splitlines()[1].split(",")
+    assert (cells[2], float(cells[3])) == ("", pytest.approx(mean, rel=1e-4))
     code, _, err = call("generate", out, "--bands", "--out", bands)
     assert (code, "--bands: expected --commands FILE" in err) == (2, True)

@@ -247,6 +247,25 @@ def test_what_cannot_be_exported_is_refused(corrected: DynamicsTwin, tmp_path: P
     assert not list(tmp_path.iterdir())
 
 
+def test_a_right_twin_is_exported_with_the_bands_of_its_noise(tmp_path: Path) -> None:
+    """What `fit` saves where there is nothing to correct: identified parameters and noise."""
+    twin = tank("hold")
+    made = twin.simulate(commanded(4, 0), seed=0, parameters={"drain": 1.1, "leak": 0.6})
+    noise = np.random.default_rng(1).normal(size=made.observed.shape) * [0.02, 0.05]
+    real = made.replace(observed=made.observed + noise, labels=["Healthy"] * 4)
+    fitted = rt.fit(twin, real, rt.Choice(method="parameters", compare=False), seed=0).twin
+    fitted.save(tmp_path / "model")
+    path = export_fmu(rt.load_twin(tmp_path / "model"), tmp_path / "tank.fmu").path
+    u = commanded(1, 5)
+    found = simulated(path, u[0], 1 / twin.rate, noise=True, seed=3)
+    nominal = fitted.surrogate.predict(u)[0]
+    for i, (name, deviation) in enumerate(zip(twin.outputs.names, (0.02, 0.05), strict=True)):
+        np.testing.assert_allclose(found[f"{name}.mean"], nominal[:, i], atol=1e-5)
+        width = found[f"{name}.q95"] - found[f"{name}.q05"]
+        np.testing.assert_allclose(width, 3.29 * deviation, rtol=0.25)
+        assert np.std(found[name] - nominal[:, i]) == pytest.approx(deviation, rel=0.35)
+
+
 def test_the_command_line_exports_a_saved_twin(
     corrected: DynamicsTwin, call, tmp_path: Path
 ) -> None:

@@ -24,7 +24,7 @@ from retwin.cli.options import (
     seconds_of,
 )
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import read, system_of, updated_twin
+from retwin.cli.reading import read, read_commands, system_of, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import Trajectories
@@ -71,7 +71,7 @@ def generate(
     kind = check_target(out)
     updated = updated_twin(model)
     if commands is not None:
-        records = read(commands, system_of(updated, model, case), mapping=mapping)
+        records = read_commands(commands, system_of(updated, model, case), mapping=mapping)
         rt.save(updated.simulate(records.commands.astype(float), seed=seed), out)
         note(f"Wrote {len(records)} trajectories to {out}")
         return
@@ -96,7 +96,7 @@ def _write_bands(
     from retwin.evaluation import predict_records
 
     updated = updated_twin(model)
-    records = read(commands, system_of(updated, model, case), mapping=mapping)
+    records = read_commands(commands, system_of(updated, model, case), mapping=mapping)
     write_predictions(predict_records(updated, records, seed=seed), records, out)
     note(f"Wrote mean and 90 % bands of {len(records)} records to {out}")
 

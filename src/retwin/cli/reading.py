@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from retwin.checks import existing, given
 from retwin.cli.terminal import bar, note
@@ -83,3 +86,20 @@ def read(
             max_bytes=max_bytes,
             mapping=mapping,
         )
+
+
+def read_commands(file: Path, case: Case, *, mapping: Path | None = None) -> Trajectories:
+    """The same to be simulated: a table may hold the commands alone."""
+    from retwin.cases import LogReader
+    from retwin.twins import FunctionTwin
+
+    twin, table = case.twin, mapping is None and file.suffix.lower() == ".csv" and file.is_file()
+    if not table or LogReader().measured_outputs([file], twin):
+        return read(file, case, mapping=mapping)
+    # A twin whose outputs are its commands, so that no output is missing.
+    alone = FunctionTwin(lambda u: u, rate=twin.rate, inputs=twin.inputs, outputs=twin.inputs)
+    found = read(file, replace(case, twin=alone))
+    nothing = np.zeros((*found.commands.shape[:2], len(twin.outputs)))
+    unseen = np.zeros(nothing.shape, dtype=bool)
+    outputs = {"outputs": twin.outputs, "nominal": nothing, "observed": nothing, "mask": unseen}
+    return found.replace(**outputs)

@@ -24,6 +24,8 @@ from retwin.serialisation.files import write_atomically
 from retwin.twins.state_twin import StateTwin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.unknowns import state_names
+from retwin.update.residual.stationary import StationaryResidual
 from retwin.update.surrogate import Surrogate
 
 VERSIONS = ("2.0", "3.0")
@@ -86,9 +88,10 @@ def export_fmu(
     Parameters
     ----------
     twin : StateTwin, DynamicsTwin, Surrogate or CorrectedTwin
-        A twin with state equations, corrected dynamics, or a surrogate, alone, with a residual at
-        each sample (`Additive`), or with delays and offsets (`CommandSpace`, `DelayOffset`), of
-        which one z is drawn for a whole simulation.
+        A twin with state equations, also with its errors as noise, which is white in the FMU,
+        corrected dynamics, or a surrogate, alone, with a residual at each sample (`Additive`), or
+        with delays and offsets (`CommandSpace`, `DelayOffset`), of which one z is drawn for a whole
+        simulation.
     path : path
         The file, *.fmu.
     version : str
@@ -147,8 +150,10 @@ def export_fmu(
 
 def _text(twin: object, commands: NDArray | None) -> Text:
     """The C text of a twin of any kind that has one."""
-    if isinstance(twin, StateTwin | DynamicsTwin):
-        return states_text(twin)
+    stationary = isinstance(getattr(twin, "residual", None), StationaryResidual)
+    noisy = stationary and state_names(getattr(getattr(twin, "surrogate", None), "twin", None))
+    if isinstance(twin, StateTwin | DynamicsTwin) or noisy:
+        return states_text(twin)  # type: ignore[arg-type]
     if isinstance(twin, Surrogate | CorrectedTwin):
         return surrogate_text(twin, commands)
     raise InputError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import ceil
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,12 +14,14 @@ from retwin.compiler import c_source
 from retwin.deploy.fmu.description import Variable, variables_of
 from retwin.deploy.fmu.text import Text, constants
 from retwin.twins.state_twin import StateTwin
+from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.unknowns import state_twin_of
 
 
-def states_text(twin: StateTwin | DynamicsTwin) -> Text:
-    """A twin with state equations, or corrected dynamics, as C text.
+def states_text(twin: StateTwin | DynamicsTwin | CorrectedTwin) -> Text:
+    """A twin with state equations, alone or with stationary noise, or corrected dynamics, as C.
 
     Raises
     ------
@@ -26,8 +29,8 @@ def states_text(twin: StateTwin | DynamicsTwin) -> Text:
         Its commands are splines between samples, which are not known before later samples are.
 
     """
-    ranged = not isinstance(twin, StateTwin)
-    corrected = _as_corrected(twin) if isinstance(twin, StateTwin) else twin
+    ranged = isinstance(twin, DynamicsTwin)
+    corrected = twin if isinstance(twin, DynamicsTwin) else _as_corrected(twin)
     interpolation = corrected.equations.interpolation
     require(
         interpolation != "spline",
@@ -47,10 +50,17 @@ def states_text(twin: StateTwin | DynamicsTwin) -> Text:
     )
 
 
-def _as_corrected(twin: StateTwin) -> DynamicsTwin:
-    """The equations as corrected dynamics without discrepancy and noise."""
+def _as_corrected(given: StateTwin | CorrectedTwin) -> DynamicsTwin:
+    """The equations as corrected dynamics without discrepancy, and with white noise if any."""
+    if isinstance(given, StateTwin):
+        twin, values, noise = given, given.values(None, 1)[0], np.zeros(len(given.outputs))
+    else:
+        inside: Any = given.surrogate
+        twin, _, named = state_twin_of(inside.twin)
+        values = np.array([named[name] for name in twin.names])
+        residual: Any = given.residual
+        noise = (residual.spread * residual.scale).double().numpy() ** 2
     names = twin.names
-    values = twin.values(None, 1)[0]
     states, inputs = len(twin.states), len(twin.inputs)
     limits = twin.limits
     low, high = (
@@ -75,11 +85,12 @@ def _as_corrected(twin: StateTwin) -> DynamicsTwin:
         nothing,
         nothing,
         nothing,
-        np.zeros(len(twin.outputs)),
+        noise,
         np.ones(len(twin.outputs)),
         np.zeros(len(twin.outputs)),
         domain,
         (),
+        case=getattr(given, "case", ""),
     )
 
 
