@@ -238,9 +238,7 @@ def test_noise_is_learned_by_group() -> None:
         None,
         first,
         infer=lambda state, noise: None,
-        learn=lambda _, noise: noise.learned(
-            problem, residual, common=(0.1,) * 2, blocks=(400,) * 2
-        ),
+        learn=lambda _, noise: noise.learned(problem, residual, common=0.1, blocks=400),
         rounds=20,
     )
     wanted = torch.tensor([[0.3, 2.0], [0.9, 6.0]], dtype=torch.float64)
@@ -253,7 +251,7 @@ def test_a_group_without_samples_keeps_its_scale() -> None:
     problem = Linear.drawn(3, 10, seed=1)
     noise = Noise(torch.ones(2, 2).double(), torch.ones(2).double())
     residual = 5 * problem.observed
-    found = noise.learned(problem, residual, common=(0.0,) * 2, blocks=(1,) * 2)
+    found = noise.learned(problem, residual, common=0.0, blocks=1)
     assert (found.scale[0] > 1.5).all()
     assert found.scale[1].tolist() == [1.0, 1.0]
 

@@ -388,11 +388,12 @@ def _scaled(total: Tensor, count: Tensor, rng: np.random.Generator | None) -> Te
 def _level(design: Design, variance: Tensor, rng: np.random.Generator | None = None) -> Tensor:
     """What variances (G,) of tied groups are expected to be, in squares of their units.
 
-    It is the most probable value, or a draw; beforehand all standard deviations are as probable.
+    It is the most probable value, or a draw. Beforehand its root, a standard deviation, is
+    half-normal with a scale of one unit: any smaller one is as probable.
     """
     first, last = design.tied
     if first == last:
         return variance.new_ones(())
-    precision = FREEDOM * (design.unit.square() / variance)[first:last].sum()
+    precision = FREEDOM * (design.unit.square() / variance)[first:last].sum() + 1
     count = (last - first) * FREEDOM + 1
     return (count if rng is None else float(rng.chisquare(count))) / precision

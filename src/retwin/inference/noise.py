@@ -8,7 +8,6 @@ that fewer count than were measured: a first-order autoregression of coefficient
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,8 +98,8 @@ class Noise:
         problem: Problem,
         residual: Tensor,
         *,
-        common: Sequence[float],
-        blocks: Sequence[float],
+        common: float,
+        blocks: float,
         rounding: tuple[float, ...] = (),
         variance: Tensor | float = 0.0,
         floor: float = 1e-18,
@@ -115,11 +114,11 @@ class Noise:
             Of all rows that share the noise.
         residual : Tensor
             (R, K, d), at the most probable latent variables.
-        common : sequence of float
-            Of each group, the variance of the error that is common to a block of samples, relative
-            to that of a sample: it does not average out, however many samples a block has.
-        blocks : sequence of float
-            The number of blocks of each group in all rows together, at least 1.
+        common : float
+            Variance of the error that is common to a block of successive samples, relative to that
+            of a sample: it does not average out, however many samples a block has.
+        blocks : float
+            The number of blocks in all rows together, at least 1.
         rounding : tuple of float
             Variance of the error by rounding in each group, where values do not change in a block:
             the part of it that noise does not average out is common to the block too.
@@ -151,8 +150,8 @@ class Noise:
             kept = residual / self.scale[k] * (weights * part).sqrt()
             time = correlation_time(kept, part[..., 0], rows=False, limit=MAX_CORRELATION)
             # Exact outputs have a scale of 0.
-            share = (shared / scale[-1].square().mean().clamp_min(1e-300)).clamp_min(common[k])
-            thinning.append(time + share * count / blocks[k])
+            share = (shared / scale[-1].square().mean().clamp_min(1e-300)).clamp_min(common)
+            thinning.append(time + share * count / blocks)
         scales = torch.stack(scale)
         smallest = max(floor, SMALLEST_SHARE * float(scales.amax()))
         return Noise(scales.clamp_min(smallest), torch.stack(thinning), self.loss)

@@ -19,7 +19,7 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.inference.em import expectation_maximisation
 from retwin.inference.hierarchy import Hierarchy, Likelihood
-from retwin.inference.noise import Noise, predicted_variance
+from retwin.inference.noise import Noise
 from retwin.inference.solver import Solution, blocks
 from retwin.threads import one_thread
 from retwin.update.corrections.command_problem import CommandProblem
@@ -34,7 +34,11 @@ from retwin.update.corrections.missed_segments import (
     fitted,
     searched,
 )
-from retwin.update.corrections.offset_features import GRID_VARIANCE, OffsetFeatures
+from retwin.update.corrections.offset_features import (
+    FIRST_OFFSET,
+    GRID_VARIANCE,
+    OffsetFeatures,
+)
 from retwin.update.corrections.sample_noise import SampleNoise
 
 MAX_ROUNDS = 12
@@ -49,14 +53,12 @@ OUTLYING = 3.0
 """Noise scales beyond which a sample is an outlier."""
 OUTLYING_SHARE = 0.3
 """Share of outliers above which a segment is suspect."""
-FIRST_OFFSET = 0.05
-"""Standard deviation of an offset at first, in that of the commands' targets."""
 FIRST_ODDS = -4.0
 """Log odds at first that an actuator misses a segment: about one in fifty."""
 FIRST_JITTER = 1 / 35
 """Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
 SMALLEST_SHARE = 0.1
-"""Smallest share of the samples in motion that is taken to be left after z* has been fitted."""
+"""Smallest share of the samples that is taken to be left after z* has been fitted to them."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -271,21 +273,24 @@ class Hyperparameters:
         )
 
     def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
-        """The noise of residuals, to a part of which z* has been fitted."""
-        design = self.features.design(white)
-        likelihood = Likelihood.of(solution, self.hierarchy.prior(design))
-        covariance = self.hierarchy.posterior_covariance(design, likelihood)
-        residual, jacobian = white.linearised(solution.x)
-        motion = (white.group == 1) & (white.measured > 0)
-        # What outputs in motion determine, of which the residual is left.
-        precision = self.noise.precision(white, residual)[motion]
-        fitted = (precision * predicted_variance(jacobian, covariance)[motion]).sum()
-        left = 1 - fitted / max(1, precision.numel())
-        within, residual = white.within_segments(residual, self.noise.weights(white, residual))
-        conditions = len(self.features.conditions(white)[white.valid].unique(dim=0))
-        noise = within.learned_noise(self.noise, residual, floor=FLOOR, conditions=conditions)
-        factor = torch.stack([torch.ones_like(left), left.clamp(SMALLEST_SHARE, 1.0).rsqrt()])
-        return replace(noise, scale=noise.scale * factor[:, None])
+        """The noise of residuals, of which z* has fitted a part: few samples seem too exact.
+
+        Errors of the path between two levels are those of all replicates of a condition, so that
+        these count once (Kish, Survey Sampling, 1965: the mean size of a sample's cluster).
+        """
+        residual = white.residual(solution.x)
+        learned = white.learned_noise(self.noise, residual, floor=FLOOR)
+        rest = white.measured[white.group == 0].sum() / white.valid.sum().clamp_min(1)
+        creep = white.creep(learned, residual) * rest
+        size = self.features.conditions(white)[white.valid].unique(dim=0, return_counts=True)[1]
+        replicates = size.double().square().sum() / size.sum().clamp_min(1)
+        own, path = learned.thinning
+        open_ = (self.prior(white).gaussian.precision * solution.covariance).sum()
+        fitted = solution.x.numel() - open_  # components of x that the outputs determine
+        count = white.measured.sum() * white.observed.shape[2]
+        left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
+        thinning = torch.stack([own + creep, path * replicates.clamp_min(1)])
+        return replace(learned, scale=learned.scale / left.sqrt(), thinning=thinning)
 
     def near(self, other: Hyperparameters) -> bool:
         """Whether all standard deviations are about those of `other`."""
@@ -309,7 +314,10 @@ def _discrepancy(
     design = hyperparameters.features.design(problem)
     prior = hyperparameters.prior(problem).gaussian
     common = _common(problem)
-    found, covariance = hierarchy.integrated(design, Likelihood.of(solution, prior))
+    # A limit holds x: the likelihood has no slope beyond it.
+    held = replace(solution, gradient=torch.zeros_like(solution.gradient))
+    found, covariance = hierarchy.integrated(design, Likelihood.of(held, prior))
+    found = found.clamp(problem.bounds.lower, problem.bounds.upper)
     x, mean = (
         (common @ problem.per_segment(each)[..., None])[..., 0] for each in (found, prior.mean)
     )

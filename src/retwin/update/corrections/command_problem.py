@@ -29,10 +29,14 @@ COMMAND_STEP = 1e-4
 SETTLING = 0.5
 """Time after the end of a command's ramp in which an output may still be in motion, in largest
 delays."""
-COMMON_ERROR = 0.5
+COMMON_ERROR = 0.25
 """Variance of the error that all samples of a segment have in common, relative to that of one
-sample: what rounding leaves of a sensor whose noise is a quarter of its resolution, if glitches
-hardly count. Outputs cannot tell it from an offset, so it is no estimate."""
+sample: what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
+resolution. Outputs cannot tell it from an offset, so it is no estimate."""
+SAMPLES_OF_HALVES = 4
+"""Samples at least of a rest whose halves are compared."""
+HYPERPRIOR_RESTS = 2.0
+"""Rests without any creep that are assumed besides those measured."""
 LARGE_ERROR = 2.0
 """Error of the surrogate, in that of half of the samples, beyond which nothing is learned from a
 segment but its own z."""
@@ -242,53 +246,47 @@ class CommandProblem:
         """The same with residuals as they are."""
         return replace(self, whitening=None)
 
-    def within_segments(self, residual: Tensor, weights: Tensor) -> tuple[CommandProblem, Tensor]:
-        """The problem and its residual (n, S, d_y) at rest about the mean of each segment.
-
-        What is constant throughout a rest is an offset, or as good as one: it is no noise. The
-        residual is as large as before its mean was subtracted, if samples are independent.
-        """
-        rest = self.inside * (self.group == 0)[:, None]
-        weighted = rest * weights[:, None]
-        mean = weighted @ residual / weighted.sum(dim=-1, keepdim=True).clamp_min(1e-12)
-        count = (rest.mT @ rest.sum(dim=-1, keepdim=True))[..., 0]
-        several = (count / (count - 1).clamp_min(1)).sqrt()[..., None]
-        residual = torch.where(
-            count[..., None] > 0, (residual - rest.mT @ mean) * several, residual
-        )
-        return replace(self, measured=self.measured * (count != 1)), residual
-
     def learned_noise(
-        self,
-        noise: Noise,
-        residual: Tensor,
-        variance: Tensor | float = 0.0,
-        floor: float = 1e-18,
-        conditions: int | None = None,
+        self, noise: Noise, residual: Tensor, variance: Tensor | float = 0.0, floor: float = 1e-18
     ) -> Noise:
-        """The noise at rest and in motion, see `Noise.learned`.
+        """The noise at rest and in motion, see `Noise.learned`: a block of samples is a segment.
 
-        A block of samples is a segment. In motion errors by rounding are as good as independent.
-        What outputs in motion err more than at rest is due to the path between levels, which is
-        not that of the commands; if `conditions`, the number of different segments, is given, that
-        error is the same throughout a segment and in all its replicates.
+        In motion the errors by rounding are as good as independent.
         """
-        common, blocks = COMMON_ERROR, max(1.0, float(self.valid.sum()))
-        if conditions:
-            path = 1 - float((noise.scale[0] / noise.scale[1]).square().mean())
-            common, blocks = max(common, path), float(conditions)
         rounding = self.rounding
         if self.whitening is not None:
             rounding = self.whitening.square()[self.measured > 0].mean(dim=0) @ rounding
         return noise.learned(
             self,
             residual,
-            common=(COMMON_ERROR, common),
-            blocks=(max(1.0, float(self.valid.sum())), blocks),
+            common=COMMON_ERROR,
+            blocks=max(1.0, float(self.valid.sum())),
             rounding=(float(rounding.mean()), 0.0),
             variance=variance,
             floor=floor,
         )
+
+    def creep(self, noise: Noise, residual: Tensor) -> float:
+        """Variance of what a rest's mean errs since actuators creep, in that of a sample.
+
+        A random walk ends as far from its mean as the means of its halves are apart. The residual
+        is (n, S, d_y); what `noise` explains of the distance of these means is no creep.
+        """
+        rest = self.inside * (self.group == 0)[:, None]
+        count = rest.sum(dim=-1, keepdim=True)
+        first = rest * (2 * rest.cumsum(dim=-1) <= count)
+        weights = noise.weights(self, residual)[:, None]
+        means, weight = [], []
+        for half in (first * weights, (rest - first) * weights):
+            weight.append(half.sum(dim=-1, keepdim=True).clamp_min(1e-12))
+            means.append(half @ residual / weight[-1])
+        several = count[..., 0] >= SAMPLES_OF_HALVES
+        apart = ((means[0] - means[1]).square() / noise.scale[0].square()).mean(dim=-1)
+        common = COMMON_ERROR * float(rest.sum()) / max(1.0, float(self.valid.sum()))
+        time = (noise.thinning[0] - common).clamp_min(1.0)
+        expected = time * (1 / weight[0] + 1 / weight[1])[..., 0]
+        total = (apart - expected)[several].sum() / (several.sum() + HYPERPRIOR_RESTS)
+        return max(0.0, float(total))
 
     @property
     def inside(self) -> Tensor:

@@ -25,6 +25,9 @@ MAX_EFFECTS = 1000
 """Largest number of effects of conditions; of more conditions the last ones have none."""
 EQUAL = 0.01
 """Distance, in the spread of the targets, below which commands are equal."""
+FIRST_OFFSET = 0.05
+"""Standard deviation of an offset at first, in that of the commands' targets, and the scale of its
+half-normal prior."""
 GRID_VARIANCE = 1 / 12
 """Variance of the time of an event within a sample, in samples squared."""
 ZERO, SMALL = 16.0, 0.01
@@ -131,7 +134,7 @@ class OffsetFeatures:
             kind=torch.cat([zero, kinds, torch.full((effects,), CONDITION)]),
             single=single[..., None].expand_as(wider).flatten(1),
             tied=(1, 1 + width),
-            unit=torch.cat([delay, self.spread, delay]),
+            unit=torch.cat([delay, FIRST_OFFSET * self.spread, delay]),
             share=share,
         )
 
