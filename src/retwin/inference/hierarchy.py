@@ -31,6 +31,9 @@ TOLERANCE = 1e-3
 """Relative change of all variances below which they have converged."""
 MAX_STEPS = 200
 """Steps of expectation-maximisation at most."""
+JITTER = 1e-13
+"""Added to the diagonal, relative to its largest element, where rounding makes a curvature
+indefinite."""
 WARM_UP, DRAWS = 20, 100
 """Draws of the variances that are left out first, and that are then averaged over."""
 FLAT, CONDITION = 0, -1
@@ -262,7 +265,11 @@ class Hierarchy:
         scale = variances.sqrt()[:, :, None] * variances.sqrt()[:, None, :]
         identity = torch.eye(x.shape[1], dtype=x.dtype)
         curvature = likelihood.curvature * scale
-        factor = torch.linalg.cholesky((curvature + curvature.mT) / 2 + identity)
+        curvature = (curvature + curvature.mT) / 2 + identity
+        factor, failed = torch.linalg.cholesky_ex(curvature)
+        if failed.any():
+            rounding = JITTER * curvature.diagonal(dim1=1, dim2=2).amax(dim=1) * (failed > 0)
+            factor = torch.linalg.cholesky(curvature + rounding[:, None, None] * identity)
         covariance = torch.cholesky_inverse(factor) * scale
         weighted = features * precision[..., None]
         # With x integrated out, β has this precision, and the errors ε depend on β by -left.

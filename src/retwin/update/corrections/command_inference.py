@@ -9,7 +9,6 @@ Whether an actuator missed a segment is decided by comparing evidence.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -34,11 +33,7 @@ from retwin.update.corrections.missed_segments import (
     fitted,
     searched,
 )
-from retwin.update.corrections.offset_features import (
-    FIRST_OFFSET,
-    GRID_VARIANCE,
-    OffsetFeatures,
-)
+from retwin.update.corrections.offset_features import FIRST_OFFSET, OffsetFeatures
 from retwin.update.corrections.sample_noise import SampleNoise
 
 MAX_ROUNDS = 12
@@ -218,8 +213,7 @@ class Hyperparameters:
         # The median of nothing is NaN.
         length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
         scale = length.clamp_min(FLOOR).expand(2, 1)
-        expected = math.sqrt(float(deviation) ** 2 + GRID_VARIANCE)
-        features = replace(OffsetFeatures.of(problem), jitter=expected)
+        features = OffsetFeatures.of(problem)
         offset = FIRST_OFFSET * features.spread
         design = features.design(problem)
         coefficients = torch.zeros(len(design.owner), dtype=torch.float64)
@@ -314,10 +308,12 @@ def _discrepancy(
     design = hyperparameters.features.design(problem)
     prior = hyperparameters.prior(problem).gaussian
     common = _common(problem)
-    # A limit holds x: the likelihood has no slope beyond it.
-    held = replace(solution, gradient=torch.zeros_like(solution.gradient))
-    found, covariance = hierarchy.integrated(design, Likelihood.of(held, prior))
-    found = found.clamp(problem.bounds.lower, problem.bounds.upper)
+    # What a limit holds is where the outputs have it: no other variable makes up for it.
+    limits, slope = problem.bounds, solution.gradient
+    held = (solution.x <= limits.lower) & (slope > 0) | (solution.x >= limits.upper) & (slope < 0)
+    within = replace(solution, gradient=torch.where(held, 0.0, slope))
+    found, covariance = hierarchy.integrated(design, Likelihood.of(within, prior))
+    found = found.clamp(limits.lower, limits.upper)
     x, mean = (
         (common @ problem.per_segment(each)[..., None])[..., 0] for each in (found, prior.mean)
     )

@@ -6,7 +6,6 @@ have an effect in common that no regression need explain.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -28,8 +27,9 @@ EQUAL = 0.01
 FIRST_OFFSET = 0.05
 """Standard deviation of an offset at first, in that of the commands' targets, and the scale of its
 half-normal prior."""
-GRID_VARIANCE = 1 / 12
-"""Variance of the time of an event within a sample, in samples squared."""
+DELAY_VARIANCE = 1 / 12
+"""Variance of the delays that the hyperprior expects, in samples squared: that of the time of an
+event within a sample."""
 ZERO, SMALL = 16.0, 0.01
 """Expected variance of an actuator's constant offset, and of the coefficients of a regression,
 relative to that of effects of conditions: where the zero of an actuator is says nothing of how much
@@ -50,8 +50,6 @@ class OffsetFeatures:
         (d_u,), root mean square of the distance from target to target.
     replicated : Tensor
         (C, 2 d_u), the conditions that are there more than once, see `conditions`.
-    jitter : float
-        Standard deviation of delays that the hyperprior expects, in samples.
     regression : bool
         Whether the mean of an offset depends on direction, distance and pose.
 
@@ -61,7 +59,6 @@ class OffsetFeatures:
     spread: Tensor
     travel: Tensor
     replicated: Tensor
-    jitter: float = math.sqrt(GRID_VARIANCE)
     regression: bool = False
 
     @classmethod
@@ -119,7 +116,7 @@ class OffsetFeatures:
         actuators = torch.arange(1, 1 + width)
         zero, last = torch.tensor([0]), torch.tensor([1 + width])
         group = torch.cat([zero, actuators, last.expand(problem.size - 1 - width)])
-        delay = own.new_tensor([self.jitter])
+        delay = own.new_tensor([DELAY_VARIANCE]).sqrt()
         single = (1 - match.sum(dim=-1)) * float(len(self.replicated) > 0)
         kinds = torch.arange(1, 1 + count).repeat(width)
         share = own.new_tensor([1.0, ZERO, *[SMALL] * (count - 1)])
