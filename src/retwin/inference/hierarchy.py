@@ -31,6 +31,8 @@ TOLERANCE = 1e-3
 """Relative change of all variances below which they have converged."""
 MAX_STEPS = 200
 """Steps of expectation-maximisation at most."""
+LARGEST = 1e3
+"""Largest standard deviation, in units: what outputs hardly show is linear no further."""
 JITTER = 1e-13
 """Added to the diagonal, relative to its largest element, where rounding makes a curvature
 indefinite."""
@@ -369,7 +371,7 @@ class Hierarchy:
             nothing.index_add(0, kind, each) for each in (share, torch.ones_like(share))
         )
         expected = design.share * _level(design, variance + common)
-        relative = _scaled(sums + FREEDOM * expected, counts + FREEDOM, rng)
+        relative = _scaled(sums + FREEDOM * expected, counts + FREEDOM, rng).clamp_max(LARGEST**2)
         return replace(self, variance=variance, common=common, relative=relative)
 
     def _variance(
@@ -384,7 +386,8 @@ class Hierarchy:
         first, last = design.tied
         expected = design.unit.square().clone()
         expected[first:last] *= _level(design, before, rng)
-        return _scaled(total + FREEDOM * expected, count + FREEDOM, rng)
+        found = _scaled(total + FREEDOM * expected, count + FREEDOM, rng)
+        return found.minimum((LARGEST * design.unit).square())
 
 
 def _scaled(total: Tensor, count: Tensor, rng: np.random.Generator | None) -> Tensor:

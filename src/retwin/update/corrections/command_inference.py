@@ -308,18 +308,14 @@ def _discrepancy(
     design = hyperparameters.features.design(problem)
     prior = hyperparameters.prior(problem).gaussian
     common = _common(problem)
-    # What a limit holds is where the outputs have it: no other variable makes up for it.
-    limits, slope = problem.bounds, solution.gradient
-    held = (solution.x <= limits.lower) & (slope > 0) | (solution.x >= limits.upper) & (slope < 0)
-    within = replace(solution, gradient=torch.where(held, 0.0, slope))
-    found, covariance = hierarchy.integrated(design, Likelihood.of(within, prior))
-    found = found.clamp(limits.lower, limits.upper)
+    found, covariance = hierarchy.integrated(design, Likelihood.of(solution, prior))
     x, mean = (
         (common @ problem.per_segment(each)[..., None])[..., 0] for each in (found, prior.mean)
     )
     inner, wide = (
         common @ blocks(each, segments) @ common.mT for each in (covariance, prior.covariance)
     )
+    x[..., 0].clamp_(*problem.delay_range)
     left, wide = inner.diagonal(dim1=-2, dim2=-1), wide.diagonal(dim1=-2, dim2=-1)
     severity = torch.where(problem.faulty, (x - mean)[..., 1:], 0.0)
     # Under a fault nothing was learned of the discrepancy: the prior stands.
