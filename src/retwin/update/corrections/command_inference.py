@@ -279,8 +279,10 @@ class Hyperparameters:
         size = self.features.conditions(white)[white.valid].unique(dim=0, return_counts=True)[1]
         replicates = size.double().square().sum() / size.sum().clamp_min(1)
         own, path = learned.thinning
-        open_ = (self.prior(white).gaussian.precision * solution.covariance).sum()
-        fitted = solution.x.numel() - open_  # components of x that the outputs determine
+        design = self.features.design(white)
+        likelihood = Likelihood.of(solution, self.hierarchy.prior(design))
+        covariance = self.hierarchy.posterior_covariance(design, likelihood)
+        fitted = (likelihood.curvature * covariance).sum()  # dimensions that outputs determine
         count = white.measured.sum() * white.observed.shape[2]
         left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
         thinning = torch.stack([own + creep, path * replicates.clamp_min(1)])
