@@ -111,6 +111,7 @@ def test_what_exact_measurements_leave_open_is_that_of_nearly_exact_ones() -> No
     torch.testing.assert_close(found[1].coefficients, found[0].coefficients, rtol=0.02, atol=0.01)
 
 
+@pytest.mark.slow
 def test_intervals_from_few_rows_cover() -> None:
     """Nominal 90 %: 8 rows, 200 sets. A binomial share of 6400 has a deviation of 0.004; variables
     of a set are correlated, so its 200 means are what counts, with a deviation of about 0.01."""
@@ -150,6 +151,18 @@ def test_unused_variables_do_not_count() -> None:
     data.design = replace(data.design, wider=wider, used=used)
     found = learned(data)
     assert found.variance[1] < 3 * VARIANCE[1]
+
+
+def test_variances_that_nothing_shows_stay_within_their_prior() -> None:
+    """Standard deviations are half-normal beforehand, about one unit: they cannot drift away."""
+    data = drawn(10, seed=6)
+    first = Hierarchy.of(data.design, torch.ones(2).double(), torch.zeros(4).double(), (1.0, 4.0))
+    nothing = Likelihood(
+        torch.zeros(10, 4, 4).double(), torch.zeros_like(data.x), torch.zeros_like(data.x)
+    )
+    found = first.learned(data.design, nothing)
+    assert (found.variance < 1.5).all()
+    assert torch.isfinite(found.integrated(data.design, nothing)[1]).all()
 
 
 CONDITIONS = 6
@@ -204,6 +217,7 @@ def of_one_direction(data: Drawn) -> Likelihood:
     return Likelihood(curvature, data.x, away)
 
 
+@pytest.mark.slow
 def test_replicates_tell_nothing_of_what_none_of_them_shows() -> None:
     """Of twelve runs of the same conditions as much stays open as of two, and intervals cover.
 

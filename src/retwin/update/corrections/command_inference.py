@@ -274,8 +274,6 @@ class Hyperparameters:
         """
         residual = white.residual(solution.x)
         learned = white.learned_noise(self.noise, residual, floor=FLOOR)
-        rest = white.measured[white.group == 0].sum() / white.valid.sum().clamp_min(1)
-        creep = white.creep(learned, residual) * rest
         size = self.features.conditions(white)[white.valid].unique(dim=0, return_counts=True)[1]
         replicates = size.double().square().sum() / size.sum().clamp_min(1)
         own, path = learned.thinning
@@ -285,7 +283,8 @@ class Hyperparameters:
         fitted = (likelihood.curvature * covariance).sum()  # dimensions that outputs determine
         count = white.measured.sum() * white.observed.shape[2]
         left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
-        thinning = torch.stack([own + creep, path * replicates.clamp_min(1)])
+        rest = own.clamp_min(white.creep(learned, residual))
+        thinning = torch.stack([rest, path * replicates.clamp_min(1)])
         return replace(learned, scale=learned.scale / left.sqrt(), thinning=thinning)
 
     def near(self, other: Hyperparameters) -> bool:

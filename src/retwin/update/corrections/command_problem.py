@@ -267,26 +267,24 @@ class CommandProblem:
         )
 
     def creep(self, noise: Noise, residual: Tensor) -> float:
-        """Variance of what a rest's mean errs since actuators creep, in that of a sample.
+        """Samples of a rest per independent one if actuators creep.
 
-        A random walk ends as far from its mean as the means of its halves are apart. The residual
-        is (n, S, d_y); what `noise` explains of the distance of these means is no creep.
+        A random walk ends as far from its mean as the means of its halves are apart: by a variance
+        that all samples have in common. The residual is (n, S, d_y); what independent errors
+        explain of the distance of these means is no creep.
         """
         rest = self.inside * (self.group == 0)[:, None]
-        count = rest.sum(dim=-1, keepdim=True)
-        first = rest * (2 * rest.cumsum(dim=-1) <= count)
+        count = rest.sum(dim=-1)
+        first = rest * (2 * rest.cumsum(dim=-1) <= count[..., None])
         weights = noise.weights(self, residual)[:, None]
         means, weight = [], []
         for half in (first * weights, (rest - first) * weights):
-            weight.append(half.sum(dim=-1, keepdim=True).clamp_min(1e-12))
-            means.append(half @ residual / weight[-1])
-        several = count[..., 0] >= SAMPLES_OF_HALVES
+            weight.append(half.sum(dim=-1).clamp_min(1e-12))
+            means.append(half @ residual / weight[-1][..., None])
         apart = ((means[0] - means[1]).square() / noise.scale[0].square()).mean(dim=-1)
-        common = COMMON_ERROR * float(rest.sum()) / max(1.0, float(self.valid.sum()))
-        time = (noise.thinning[0] - common).clamp_min(1.0)
-        expected = time * (1 / weight[0] + 1 / weight[1])[..., 0]
-        total = (apart - expected)[several].sum() / (several.sum() + HYPERPRIOR_RESTS)
-        return max(0.0, float(total))
+        excess = (apart - 1 / weight[0] - 1 / weight[1])[count >= SAMPLES_OF_HALVES]
+        common = COMMON_ERROR + max(0.0, float(excess.sum()) / (len(excess) + HYPERPRIOR_RESTS))
+        return 1 + common * float(count.sum()) / max(1.0, float(self.valid.sum()))
 
     @property
     def inside(self) -> Tensor:
