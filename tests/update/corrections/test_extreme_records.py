@@ -221,3 +221,14 @@ def test_the_mean_of_a_rest_errs_by_what_actuators_creep(walks: bool) -> None:
     error = noise.scale[0, 0] ** 2 * problem.creep(noise, residual) / count
     independent = scale**2 * (1 / count + COMMON_ERROR)
     np.testing.assert_allclose(error, count / 3 if walks else independent, rtol=0.25)
+
+
+def test_replicates_of_a_motion_count_once() -> None:
+    """What a path between two levels errs is the same in all four of them; at rest it is not."""
+    thinning = []
+    for copies in (1, 4):
+        context, _, outputs = measured(Plane(), commands_of(5).repeat(copies, axis=0))
+        mask = torch.ones(outputs.shape).bool()
+        learned = rt.CommandSpace().infer_with_hyperparameters(context, outputs, mask)[1]
+        thinning.append(learned.noise.thinning.numpy())
+    np.testing.assert_allclose(thinning[1] / thinning[0], [1.0, 4.0], rtol=0.2)
