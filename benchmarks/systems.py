@@ -29,8 +29,8 @@ from record import machine, rounded
 from systems import SYSTEMS, System
 from systems.methods import JOBS, METHODS, score
 
-from retwin.processes import worker_pool
 from retwin.serialisation.files import write_atomically
+from retwin.workers.pools import worker_pool
 
 HERE = Path(__file__).parent
 LIMIT = 400.0

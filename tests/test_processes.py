@@ -8,7 +8,7 @@ from pathlib import Path
 
 SCRIPT = """
 import os, signal, time
-from retwin.processes import worker_pool
+from retwin.workers.pools import worker_pool
 
 if __name__ != "__main__":  # in a worker, before it knows its task
     time.sleep(0.1 * (os.getpid() % 8))

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import retwin as rt
-from retwin.threads import Turns, available, in_threads, one_thread
+from retwin.workers.threads import Turns, available, in_threads, one_thread
 
 
 @pytest.fixture(params=[1, 3])

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import require
 from retwin.errors import InputError
-from retwin.threads import in_threads
+from retwin.workers.threads import in_threads
 
 BYTES_PER_BLOCK = 2**22
 """The size of a block of rows in bytes: it fits the cache of a processor."""

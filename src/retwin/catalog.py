@@ -231,9 +231,9 @@ LOGS: Mapping[str, LogEntry] = {
     ".tdms": LogEntry("TDMS of LabVIEW", "retwin.data.logs.tdms:read", "logs"),
     ".mf4": LogEntry("MDF 4", "retwin.data.logs.mdf:read", "logs"),
     ".mdf": LogEntry("MDF 3", "retwin.data.logs.mdf:read", "logs"),
-    ".csv": LogEntry("CSV", "retwin.data.logs.text_tables:read"),
-    ".tsv": LogEntry("CSV with tabulators", "retwin.data.logs.text_tables:read"),
-    ".txt": LogEntry("CSV with any separator", "retwin.data.logs.text_tables:read"),
+    ".csv": LogEntry("CSV", "retwin.data.tables:read"),
+    ".tsv": LogEntry("CSV with tabulators", "retwin.data.tables:read"),
+    ".txt": LogEntry("CSV with any separator", "retwin.data.tables:read"),
 }
 """By the suffix of the name; "" is a folder. They need a mapping to become trajectories."""
 

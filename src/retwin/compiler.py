@@ -21,7 +21,7 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from retwin.threads import available, in_threads
+from retwin.workers.threads import available, in_threads
 
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction and reassociation, results are those of torch up to single roundings."""

@@ -32,10 +32,11 @@ class InputError(ValueError):
 
     def __reduce__(self) -> tuple:
         """Keep the parts when the error is sent to another process."""
-        return _rebuild, (self.argument, self.expected, self.got, self.remedy)
+        return rebuild, (self.argument, self.expected, self.got, self.remedy)
 
 
-def _rebuild(argument: str, expected: str, got: str, remedy: str) -> InputError:
+def rebuild(argument: str, expected: str, got: str, remedy: str) -> InputError:
+    """The error of these parts, which another process has sent."""
     return InputError(argument, expected=expected, got=got, remedy=remedy)
 
 

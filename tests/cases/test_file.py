@@ -747,7 +747,10 @@ test = { a = "a2", b = "b", y = "y2" }
         ("text", "message"),
         [
             ("a1,b,y1,a2\n0,0,0,0\n0,0,0,0\n", r"columns a1, b, y1.*got no column y2"),
-            ("a1,b,y1,a2,y2\n0,0,x,0,0\n0,0,0,0,0\n", "could not convert"),
+            (
+                "a1,b,y1,a2,y2\n0,0,x,0,0\n0,0,0,0,0\n",
+                "numbers in columns .* got 'x' in data row 0 of y1",
+            ),
             ("a1,b,y1,a2,y2\n0,0,0,0,0\n,0,0,0,0\n0,0,0,0,0\n", "2 of 3 rows of the calibration"),
             ("a1,b,y1,a2,y2\n0,0,0,0,0\n", "two rows at least"),
             ("a1,b,y1,a2,y2\n", "two rows at least, got 0 of 0 rows"),

@@ -12,7 +12,6 @@ import pytest
 
 from retwin.catalog import EXTRAS
 from retwin.cli import doctor
-from retwin.cli.doctor import Check, examine
 
 FOR_DEVELOPERS = {"dev", "docs"}
 STATES = {"ok", "warning", "missing", "broken"}
@@ -26,9 +25,12 @@ def healthy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPat
     return monkeypatch
 
 
-def found(name: str, *, deep: bool = False) -> Check:
-    (check,) = (each for each in examine(deep=deep) if each.name == name)
-    return check
+def found(name: str, *, deep: bool = False) -> tuple[str, str, str]:
+    """State, what was found and remedy of one check."""
+    checks = (*doctor._installation(deep), *doctor._machine(deep), *doctor._data())
+    (check,) = (each for each in checks if each[0] == name)
+    _, state, words, remedy = check
+    return state if remedy else "ok", words, remedy
 
 
 # Deep, it loads every library of every extra.
@@ -103,11 +105,9 @@ def test_a_library_that_does_not_load(healthy: pytest.MonkeyPatch, tmp_path: Pat
     (tmp_path / "mujoco.py").write_text(broken)
     healthy.syspath_prepend(tmp_path)
     healthy.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    assert found("mujoco").state == "ok", "it is installed, and not loaded"
-    (check,) = (each for each in doctor._installation(deep=True) if each.name == "mujoco")
-    assert check.state == "broken"
-    assert check.found == "OSError: libmujoco.so.1: cannot open shared object file"
-    assert "install mujoco-core again" in check.remedy
+    assert found("mujoco")[0] == "ok", "it is installed, and not loaded"
+    words = "OSError: libmujoco.so.1: cannot open shared object file"
+    assert found("mujoco", deep=True) == ("broken", words, "install mujoco-core again")
 
 
 def test_a_library_that_hangs(healthy: pytest.MonkeyPatch) -> None:
@@ -123,23 +123,22 @@ def test_few_cores_and_little_memory(healthy: pytest.MonkeyPatch, tmp_path: Path
         (tmp_path / name).write_text(text)
     healthy.setattr("retwin.serialisation.sizes.CGROUP", tmp_path)
     healthy.setenv("OMP_NUM_THREADS", "64")
-    assert found("cores").state == "warning"
-    assert "OMP_NUM_THREADS=" in found("cores").remedy
-    memory = found("memory")
-    assert (memory.state, memory.found) == ("warning", "0.2 GB free of 0.5")
-    assert "--processes 1" in memory.remedy
+    assert found("cores")[0] == "warning"
+    assert "OMP_NUM_THREADS=" in found("cores")[2]
+    state, words, remedy = found("memory")
+    assert (state, words) == ("warning", "0.2 GB free of 0.5")
+    assert "--processes 1" in remedy
 
 
 def test_data_that_are_found(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    assert found("RETWIN_DATA").state == "missing"
+    assert found("RETWIN_DATA")[0] == "missing"
     healthy.setenv("RETWIN_DATA", str(tmp_path / "data"))
-    assert "data: demo" in found("RETWIN_DATA").found
+    assert "data: demo" in found("RETWIN_DATA")[1]
     (tmp_path / "data").mkdir()
-    assert found("RETWIN_DATA").state == "ok"
+    assert found("RETWIN_DATA")[0] == "ok"
     ((name, known),) = doctor.DOWNLOADS.items()
-    check = found(f"public {name}")
-    assert (check.state, check.remedy) == ("missing", f"retwin data fetch {name}")
+    assert found(f"public {name}")[::2] == ("missing", f"retwin data fetch {name}")
     file = tmp_path / "cache" / known.file
     file.parent.mkdir(parents=True)
     file.write_bytes(b"x")
-    assert found(f"public {name}").state == "ok"
+    assert found(f"public {name}")[0] == "ok"

@@ -14,7 +14,7 @@ import pytest
 from log_files import SPEEDS, csv, mcap, ros2_bag, tdms
 
 from retwin.data import load
-from retwin.data.logs import text_tables
+from retwin.data import tables as text_tables
 from retwin.data.logs.mapping import Mapping
 from retwin.data.logs.reading import read_log
 from retwin.data.logs.signals import Clock
@@ -98,7 +98,7 @@ def code(writer) -> None:
     [
         (bomb, "expected contents of at most 67.1 MB"),
         (names, "at most 10000 signals"),
-        (nested, "expected a log that is whole, got RecursionError"),
+        (nested, "at which its reader failed: RecursionError"),
         (code, "names of types and fields|whole"),
     ],
 )
@@ -219,8 +219,9 @@ def test_a_library_that_crashes_ends_with_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from retwin.data.logs import reading
+    from retwin.workers import process
 
-    monkeypatch.setattr(reading, "CODE", "import os; os.abort()  # {path}")
+    monkeypatch.setattr(process, "CODE", "import os; os.abort()  # {path}")
     monkeypatch.setattr(reading, "SAFE", 0)  # small tables of text are read here
     csv(tmp_path / "a.csv")
-    refused(tmp_path / "a.csv", r"the format's library failed \(signal 6\)")
+    refused(tmp_path / "a.csv", r"its reader failed: its process died \(signal 6\)")

@@ -7,27 +7,31 @@ import re
 import textwrap
 import tomllib
 from datetime import UTC, datetime, timedelta
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import jsonschema
 import numpy as np
+import pyarrow
 import pytest
 from log_files import BEGIN, COUNT, HEATER, RATE, SPEED, SPEEDS, TIMES, mcap, ros2_bag
+from pyarrow import parquet
 
 import retwin as rt
 from retwin.cases.twin_data import TwinData, log_case
 from retwin.data import Provenance, load, propose_mapping, read_mapping, save
-from retwin.data.logs import text_tables
+from retwin.data import tables as text_tables
+from retwin.data.logs import arrow_tables
 from retwin.data.logs.channels import in_order
 from retwin.data.logs.cutting import pieces
 from retwin.data.logs.mapped import mapped
 from retwin.data.logs.mapping import Cut, Mapping
+from retwin.data.logs.messages import Series, Types
 from retwin.data.logs.reading import read_log
-from retwin.data.logs.signals import Clock, Log, Signal, named_unit
-from retwin.data.logs.tables import row_times
+from retwin.data.logs.signals import Clock, Log, Signal, Skipped, named_unit
 from retwin.data.logs.units import compatible, converted
 from retwin.data.resampling import resampled
+from retwin.data.row_times import row_times
 from retwin.errors import InputError
 from retwin.report.log_picture import _thinned
 from retwin.serialisation.sizes import Budget
@@ -91,6 +95,24 @@ def test_joints_are_found_by_their_names_in_any_order(tmp_path: Path) -> None:
     assert "protobuf" in found.skipped["/camera"]
     assert found.begin == BEGIN
     assert not any("header.stamp" in name for name in found.signals)
+
+
+@pytest.mark.parametrize("name", ["a/msg/Unknown", "a/msg/Holder"])
+def test_messages_of_unknown_types_are_skipped_with_the_reason(name: str) -> None:
+    """Of the type itself, or of one inside it; the second message is not tried."""
+    types, series = Types(), Series(None, Clock())
+    types.define("a/msg/Holder", "Unknown inner\nfloat64 level")
+    tries = []
+
+    def decode() -> object:
+        tries.append(name)
+        return types.decode(bytes(40), name)
+
+    for recorded in range(2):
+        series.add("/a", name, recorded, decode)
+    (skipped,) = series.found()
+    assert skipped == Skipped("/a", f"messages of the type {name}, which the log does not define")
+    assert len(tries) == 1
 
 
 @pytest.mark.slow
@@ -172,6 +194,29 @@ def test_a_row_of_empty_cells_is_a_sample_where_rows_come_at_a_rate(
     for each, values in zip(signals, ([1, np.nan, 3], [5, np.nan, 7]), strict=True):
         np.testing.assert_array_equal(each.values, values)
         assert len(each.times) == 3
+
+
+def test_columns_that_differ_by_their_unit_are_named_as_a_whole(tmp_path: Path) -> None:
+    table = {"time": [0.0, 1.0], "T [K]": [280.0, 281.0], "T [°C]": [6.85, 7.85], "v [V]": [1, 2]}
+    parquet.write_table(pyarrow.table(table), tmp_path / "a.parquet")
+    text = "time,T [K],T [°C],v [V]\n0,280,6.85,1\n1,281,7.85,2\n"
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    readers = [(arrow_tables.read, "a.parquet"), (text_tables.read, "a.csv")]
+    for (read, name), wanted in product(readers, (None, frozenset(["T [K]", "T [°C]"]))):
+        found = read(tmp_path / name, wanted, Clock())
+        values = {each.name: each.values[0] for each in found if isinstance(each, Signal)}
+        assert values.items() >= {"T [K]": 280.0, "T [°C]": 6.85}.items()
+
+
+def test_numbers_are_no_times_in_a_stated_format() -> None:
+    cells = np.array(["1700000000.123456789", "1700000000,2"])
+    assert row_times(cells, "", Clock(unit="s"), "a").tolist() == [
+        1_700_000_000_123_456_789,
+        1_700_000_000_200_000_000,
+    ]
+    for clock in (Clock(unit="iso"), Clock(format="%Y%m%d")):
+        with pytest.raises(InputError, match=r"expected times: .* got '20260101\.0'"):
+            row_times(np.array([20260101.0]), "", clock, "a")
 
 
 def test_a_gap_is_missing_and_never_bridged() -> None:

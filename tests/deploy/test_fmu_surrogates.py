@@ -27,7 +27,7 @@ from retwin.twins.command_range import CommandRange
 from retwin.update.corrections import Chain, SampledSensor
 from retwin.update.residual import SequenceMixture, SequenceResidual
 from retwin.update.residual.model import ResidualModel
-from retwin.update.residual.sequence import _picked, _pooled
+from retwin.update.residual.sequence import pick, pool
 
 fmpy = pytest.importorskip("fmpy")
 build_platform_binary = pytest.importorskip("fmpy.build").build_platform_binary
@@ -185,17 +185,17 @@ def _reference(twin: rt.CorrectedTwin) -> tuple[Any, ...]:
     assert isinstance(residual, SequenceResidual)
     with torch.no_grad():
         nominal = twin.surrogate.double()(commands)
-        members = [each[0] for each in residual.distributions(torch.cat([commands, nominal], -1))]
+        (members,) = residual.distributions(torch.cat([commands, nominal], -1))
         level, *rest = uniform(1 + STEPS * 4)
-        chosen = torch.tensor([int(len(members) * level)])
+        chosen = torch.tensor([int(members.batch_shape[0] * level)])
         noise = ndtri(np.reshape(rest, (STEPS, 4)))
         share = np.concatenate([residual.persistence[:1], residual.persistence])
         for t in range(1, STEPS):
             noise[t] = share * noise[t - 1] + np.sqrt(1 - share**2) * noise[t]
-        one = Blocks([_picked(members, chosen)])
+        one = Blocks([pick(members, chosen)])
         normal = torch.tensor(noise[None, :, 1:])
         z = one.from_noise(torch.tensor(ndtr(noise[None, :, :1])), normal)
-        pooled = _pooled(members)
+        pooled = pool(members)
         bounds = residual.bounds
         values = (nominal, *(each.clamp(-bounds, bounds) for each in (z, pooled.mean)))
     return *(each[0].numpy() for each in values), pooled, bounds.numpy()

@@ -127,7 +127,7 @@ def suffix(name: str, target: Any) -> str:
     """The suffix that a command wants of that name."""
     if target.metavar == "FOLDER":
         return ""
-    own = {"bench": ".json", "data map": ".toml", "export actuator-net": ".pt"}
+    own = {"data map": ".toml", "export actuator-net": ".pt"}
     own["twin animate"] = ".gif"
     return own.get(name, ".csv" if "predict" in name else ".npz")
 

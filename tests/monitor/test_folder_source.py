@@ -15,11 +15,13 @@ from pyarrow import parquet
 
 import retwin as rt
 from retwin.data.logs.mapping import Mapping
+from retwin.data.logs.signals import Clock
+from retwin.data.row_times import row_times
 from retwin.errors import InputError
 from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.folder import Folder
-from retwin.monitor.sources.mapped_tables import mapped_layout
-from retwin.monitor.sources.tables import CHUNK, Layout, layout_of
+from retwin.monitor.sources.layouts import layout_of, mapped_layout
+from retwin.monitor.sources.tables import CHUNK, Layout
 
 SECOND = 10**9
 CHANNELS = ("heater", "T1")
@@ -64,6 +66,21 @@ def test_files_appear_and_grow_and_only_complete_rows_count(logs: Path) -> None:
     expected = [[1, 5], [0, nan], [1, 20], [1, 21], [0, nan], [1, nan], [1, 1]]
     np.testing.assert_array_equal(gate.values("line1"), expected)
     assert len(lines) == 1
+
+
+def test_a_table_without_a_mapping_is_read_as_logs_are(logs: Path) -> None:
+    """Separator, decimal comma and lines above the titles are found; units are not converted."""
+    lines: list[str] = []
+    gate = CollectingGate()
+    (logs / "a.csv").write_text("Export 7\n\nT1 [°C];time;heater\n")
+    with running(source(logs.parent, lines), gate):
+        time.sleep(0.1)
+        with (logs / "a.csv").open("a") as file:
+            file.write("20,5;1,5;1\n;;\n21;2,5;x\n22;3,5;on\n")
+        wait(lambda: len(seconds(gate)) == 2, lines)
+    assert seconds(gate) == [1.5, 3.5]
+    np.testing.assert_array_equal(gate.values("line1"), [[1, 20.5], [1, 22]])
+    assert "'x' in a.csv, column 'heater'" in lines[-1]
 
 
 def test_rows_that_cannot_be_read_are_counted_and_stop_nothing(logs: Path) -> None:
@@ -196,7 +213,7 @@ def test_columns_are_those_of_the_case_unless_they_are_given() -> None:
     ],
 )
 def test_times_are_read_exactly(unit: str, cell: str, expected: int) -> None:
-    assert Layout("time", unit, ()).nanoseconds(cell) == expected
+    assert row_times(np.array([cell]), "", Clock(unit=unit), "a").tolist() == [expected]
 
 
 TWIN = {

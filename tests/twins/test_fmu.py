@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import pickle
 import platform
@@ -354,6 +353,7 @@ def test_progress_is_reported_per_trajectory(lag: Path) -> None:
 def test_native_code_stays_out_of_this_process_and_off_the_disk(
     lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    others = set(psutil.Process().children())
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     commands = np.zeros((2, 10, 2))
     twin = pickle.loads(pickle.dumps(FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x"])))
@@ -365,7 +365,7 @@ def test_native_code_stays_out_of_this_process_and_off_the_disk(
         )
     assert seen == [1, 1]
     assert not list(tmp_path.iterdir())
-    assert not multiprocessing.active_children()
+    assert set(psutil.Process().children()) <= others
     if sys.platform == "linux":
         assert "Lag.so" not in Path("/proc/self/maps").read_text("utf-8")
 
@@ -442,17 +442,13 @@ def test_an_fmu_that_does_not_load_is_refused_once(tmp_path: Path, load: int, wh
         twin.simulate(np.zeros((3, 10, 1)), seed=0)
 
 
-def test_a_script_without_a_guard_is_advised(lag: Path, tmp_path: Path) -> None:
+def test_a_script_needs_no_guard(lag: Path, tmp_path: Path) -> None:
     text = SCRIPT.split("if __name__")[0] + (
         f"twin = FMUTwin.from_file({str(lag)!r}, 100.0, ['u'], ['x'], workers=1)\n"
         "twin.simulate(np.zeros((1, 10, 1)), seed=0)\n"
     )
     (tmp_path / "main.py").write_text(text)
-    ran = subprocess.run(
-        [sys.executable, tmp_path / "main.py"], capture_output=True, text=True, timeout=120
-    )
-    assert ran.returncode == 1
-    assert "in a script simulate under `if __name__ == '__main__':`" in ran.stderr
+    subprocess.run([sys.executable, tmp_path / "main.py"], check=True, timeout=120)
 
 
 def test_members_stay_in_the_folder(
@@ -546,9 +542,10 @@ def test_ten_thousand_runs_do_not_grow_the_worker(lag: Path, log: Path) -> None:
         pytest.skip("reads /proc")
     twin = FMUTwin.from_file(lag, RATE, ["u"], ["x"], workers=1)
     memory: list[float] = []
+    others = set(psutil.Process().children())
 
     def measure(share: float) -> None:
-        for child in multiprocessing.active_children():
+        for child in set(psutil.Process().children()) - others:
             pages = int(Path(f"/proc/{child.pid}/statm").read_text("utf-8").split()[1])
             memory.append(pages * 4096 / 2**20)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from glob import glob
 from itertools import chain
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from retwin.cases.time_column import TimeColumn
 from retwin.checks import finite, require
-from retwin.data.logs.text_tables import read_cells
+from retwin.data.tables import Table, read_titled
 from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
@@ -215,13 +215,11 @@ class ColumnRecords:
             for name in ("calibration", "test")
         )
         self._check_separate(*([record for _, record in each] for each in (calibration, test)))
-        wanted: dict[Path, dict[str, Callable[[str], float]]] = {}
-        for file, record in (*calibration, *test):
-            cells = wanted.setdefault(file, {})
-            cells |= dict.fromkeys(record.every_column, number)
-            if record.clock:
-                cells[record.clock.column] = record.clock.number
-        tables = {file: read_columns(file, cells) for file, cells in wanted.items()}
+        every = (*calibration, *test)
+        files = dict.fromkeys(file for file, _ in every)
+        tables = {
+            file: _table(file, [own for path, own in every if path == file]) for file in files
+        }
         sources = {file: Provenance(file.name, sha256(file)) for file in tables}
 
         def made(name: str, found: Sequence[tuple[Path, Record]]) -> Trajectories:
@@ -237,14 +235,14 @@ class ColumnRecords:
 
 
 def record_in(
-    table: Mapping[str, NDArray], record: Record, twin: Twin, name: str, source: Provenance
+    table: Table, record: Record, twin: Twin, name: str, source: Provenance
 ) -> Trajectories:
     """One record in a table, as a trajectory.
 
     Parameters
     ----------
-    table : mapping of str to ndarray, shape (T,)
-        Columns by name.
+    table : Table
+        With the columns of the record.
     record : Record
         The column of each channel, and the rows.
     twin : Twin
@@ -261,17 +259,15 @@ def record_in(
 
     """
     rows = slice(*(record.rows or (None,)))
-    clock, rate, seconds = record.clock, twin.rate, np.empty(0)
-    if clock is not None:
-        place = f"{source.name}, {name} record"
-        seconds = clock.seconds(table[clock.column][rows], rate, place)
+    clock, rate = record.clock, twin.rate
+    seconds = np.empty(0) if clock is None else clock.seconds(table, rows, rate, name)
+    count = len(range(table.rows)[rows])
 
     def values(channels: Channels, held: bool) -> NDArray:
         columns = [
-            np.mean([table[each][rows] for each in several], axis=0)
+            np.mean([table.cells(each)[rows] for each in several], axis=0)
             for several in record.columns_of(channels)
         ]
-        count = len(next(iter(table.values()))[rows])
         found = np.array(columns).T.reshape(count, len(channels))
         if clock is not None:
             found = clock.sampled(seconds, found, rate, held=held)
@@ -315,26 +311,24 @@ def record_in(
     )
 
 
-def number(cell: str) -> float:
-    """The number in a cell, NaN in an empty one; ValueError if it is none."""
-    truth = {"true": 1.0, "false": 0.0}.get(cell.strip().lower())
-    return float(cell or "nan") if truth is None else truth
+def _table(path: Path, records: Sequence[Record]) -> Table:
+    """The columns of some records in a file: numbers, and the times as they are written.
 
-
-def read_columns(path: Path, cells: Mapping[str, Callable[[str], float]]) -> dict[str, NDArray]:
-    """Columns of a CSV file, each by a function of its cells."""
-    try:
-        table, comma = read_cells(path, tuple(cells))
-        return {
-            name: np.array([number(each.replace(",", ".") if comma else each) for each in own])
-            for (name, own), number in zip(table.items(), cells.values(), strict=True)
-        }
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise InputError(
-            str(path),
-            expected=f"a CSV file with a header and numbers in columns {', '.join(cells)}",
-            got=f"{type(error).__name__}: {error}",
-            remedy="name the columns as the file does",
-        ) from None
+    Raises InputError where a cell of a channel is no number.
+    """
+    channels = dict.fromkeys(chain(*(each.every_column for each in records)))
+    clocks = [each.clock.column for each in records if each.clock]
+    names = list(dict.fromkeys([*channels, *clocks]))
+    table = read_titled(path, names)
+    columns = {name: table.cells(name) for name in names}
+    for name in channels:
+        columns[name], bad = table.numbers(name)
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise InputError(
+                table.place,
+                expected=f"numbers in columns {', '.join(names)}",
+                got=f"{str(table.cells(name)[row])[:40]!r} in data row {row} of {name}",
+                remedy="correct that cell, or leave it empty where nothing was measured",
+            )
+    return replace(table, cells=columns.__getitem__)

@@ -12,8 +12,8 @@ from retwin.data.logs.mapping import ChannelMapping, Cut, TimeSettings
 from retwin.data.logs.mapping import Mapping as LogMapping
 from retwin.data.logs.proposal import channel_mapping, cut_at_pauses, shortest_pause
 from retwin.data.logs.signals import UNWANTED, Log, named_unit
-from retwin.data.logs.tables import EVEN, TIMES
 from retwin.data.resampling import longest_bridge
+from retwin.data.tables import EVEN, TIMES
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.twins.twin import Twin

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import one_of, positive, require
+from retwin.data.logs.signals import NANOSECOND, NANOSECONDS, Clock
 from retwin.data.resampling import SAME, Resampling, longest_bridge, resampled
+from retwin.data.row_times import row_times
+from retwin.data.tables import Table
 
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "iso": 1.0}
-"""Units of times, in s."""
+UNITS = (*NANOSECONDS, "iso")
+"""Units of times."""
 WRONG_UNIT = 100.0
 """Ratio of the interval between rows to the sample period at which the unit is refused; units
 differ by a factor of 1000."""
@@ -57,40 +59,28 @@ class TimeColumn:
         if self.max_gap is not None:
             positive("max_gap", self.max_gap, unit="s", remedy="leave it out")
 
-    def number(self, cell: str) -> float:
-        """The time in a cell, in the column's unit, or for ISO text in s since 1970.
-
-        Raises
-        ------
-        ValueError
-            It is no time.
-
-        """
-        if self.unit != "iso":
-            return float(cell)
-        time = datetime.fromisoformat(cell.strip())
-        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
-
-    def seconds(self, times: NDArray, rate: float, place: str) -> NDArray:
-        """Times (T,) in s since the first one.
+    def seconds(self, table: Table, rows: slice, rate: float, record: str) -> NDArray:
+        """Times (T,) of some rows in s since the first one.
 
         Raises
         ------
         InputError
             There are fewer than two, one is missing, repeated, or before the one above, they hardly
             cover the record, or their unit does not suit the sample rate in Hz. The message names
-            `place`.
+            the record.
 
         """
-        known = np.isfinite(times)
+        place = f"{table.place}, {record} record"
+        cells, _, _ = table.stamps(self.column)
+        times = row_times(cells[rows], "", Clock(unit=self.unit), place)
         require(
-            len(times) >= 2 and known.all(),
+            len(times) >= 2,
             place,
             expected=f"two rows at least, with a time in column {self.column!r} of each",
-            got=f"{int(known.sum())} times in {len(times)} rows",
+            got=f"{len(times)} rows",
             remedy="check column and rows",
         )
-        steps = np.diff(times) * UNITS[self.unit]
+        steps = np.diff(times) * NANOSECOND
         row = int(np.argmax(steps <= 0))
         require(
             steps[row] > 0,
@@ -108,7 +98,7 @@ class TimeColumn:
             got=f"a median of {ratio / rate:g} s with unit {self.unit!r}",
             remedy=f"give the unit of column {self.column!r}: {', '.join(UNITS)}",
         )
-        elapsed: NDArray = (times - times[0]) * UNITS[self.unit]
+        elapsed: NDArray = (times - times[0]) * NANOSECOND
         row = int(np.argmax(steps))
         require(
             elapsed[-1] * rate < WRONG_UNIT * len(times),
@@ -125,11 +115,8 @@ class TimeColumn:
 
         `held` values are constant until the next, others change along straight lines.
         """
-        near = SAME / rate
-        grid = np.arange(int((seconds[-1] + near) * rate) + 1) / rate
-        made = np.empty((len(grid), values.shape[1]))
+        grid = np.arange(int((seconds[-1] + SAME / rate) * rate) + 1) / rate
         longest = self.max_gap or longest_bridge(seconds, 1 / rate)
-        for place, own in enumerate(values.T):
-            how: Resampling = "hold" if held else "linear"
-            made[:, place] = resampled(seconds, own, grid, 1 / rate, how, longest=longest)
-        return made
+        how: Resampling = "hold" if held else "linear"
+        columns = [resampled(seconds, v, grid, 1 / rate, how, longest=longest) for v in values.T]
+        return np.array(columns).reshape(len(values.T), len(grid)).T

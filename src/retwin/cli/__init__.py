@@ -145,11 +145,11 @@ def _run() -> int:
         code: int = command_tree()(prog_name="retwin", standalone_mode=False) or 0
         if code != INTERRUPTED:
             return code
-        complain_of_interruption(kept=False)
-    except Interrupted:
-        complain_of_interruption(kept=True)
+        complain_of_interruption()
+    except Interrupted as error:
+        complain_of_interruption(str(error))
     except (KeyboardInterrupt, typer.Abort):
-        complain_of_interruption(kept=False)
+        complain_of_interruption()
     except InputError as error:
         complain(str(error))
         return BAD_INPUT

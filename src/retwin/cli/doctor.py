@@ -12,14 +12,12 @@ import platform
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, TypeAlias
 
 import typer
 from packaging.requirements import Requirement
-from packaging.specifiers import SpecifierSet
 
 from retwin._version import __version__
 from retwin.catalog import DOWNLOADS, EXTRAS
@@ -40,28 +38,9 @@ if torch.cuda.is_available(): print(torch.cuda.get_device_name())
 elif torch.accelerator.is_available(): print(torch.accelerator.current_accelerator())
 else: print("none that torch can use, and none is needed")"""
 
-
-@dataclass(frozen=True)
-class Check:
-    """The result of one check.
-
-    Attributes
-    ----------
-    name : str
-        What was checked.
-    state : {"ok", "warning", "missing", "broken"}
-        As it should be; works with a drawback; absent and optional; absent and required.
-    found : str
-        What was found, in words.
-    remedy : str
-        What to do; "" if nothing is needed.
-
-    """
-
-    name: str
-    state: Literal["ok", "warning", "missing", "broken"]
-    found: str
-    remedy: str = ""
+Found: TypeAlias = tuple[str, str, str, str]
+"""A check: what is checked; its state where something has to be done, which is "warning", "missing"
+for what is optional or "broken"; what was found; and what has to be done, "" for nothing."""
 
 
 def doctor(
@@ -71,74 +50,48 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Check installation, machine and data, and name what is missing."""
-    checks = examine(deep=deep)
-    broken = [each.name for each in checks if each.state == "broken"]
+    checks = [
+        {"name": name, "state": state if remedy else "ok", "found": found, "remedy": remedy}
+        for name, state, found, remedy in (*_installation(deep), *_machine(deep), *_data())
+    ]
+    broken = ", ".join(each["name"] for each in checks if each["state"] == "broken")
     rows = [
-        (each.state, each.name, f"{each.found}\n→ {each.remedy}" if each.remedy else each.found)
+        (each["state"], each["name"], "\n→ ".join(filter(None, (each["found"], each["remedy"]))))
         for each in checks
     ]
-    verdict = f"broken: {', '.join(broken)}; retwin cannot work like this."
-    shown = verdict if broken else "retwin works on this machine."
-    answer(
-        {"ok": not broken, "checks": checks},
-        *(table(("state", "what", "found"), rows), "", shown),
-        as_json=as_json,
-    )
+    shown = f"broken: {broken}; retwin cannot work like this."
+    verdict = shown if broken else "retwin works on this machine."
+    screen = (table(("state", "what", "found"), rows), "", verdict)
+    answer({"ok": not broken, "checks": checks}, *screen, as_json=as_json)
     if broken:
         raise typer.Exit(FAILED)
 
 
-def examine(*, deep: bool = False) -> list[Check]:
-    """Run all checks; nothing is changed.
-
-    Parameters
-    ----------
-    deep : bool
-        Whether compiled packages are imported, each in a process of its own.
-
-    Returns
-    -------
-    list of Check
-        Results in the order of the output.
-
-    """
-    return [*_installation(deep), *_extras(), *_machine(deep), *_data()]
-
-
-def _installation(deep: bool) -> Iterator[Check]:
-    yield Check("retwin", "ok", f"{__version__} in {Path(__file__).parents[1]}")
-    needed = SpecifierSet(metadata.metadata("retwin")["Requires-Python"])
-    fits = needed.contains(platform.python_version(), prereleases=True)
-    python = f"{platform.python_version()}, {sys.executable}"
-    remedy = "" if fits else f"take Python {needed}"
-    yield Check("Python", "ok" if fits else "broken", python, remedy)
+def _installation(deep: bool) -> Iterator[Found]:
+    """Versions of what is needed, and the extras."""
+    yield "retwin", "ok", f"{__version__} in {Path(__file__).parents[1]}", ""
+    system = f"{platform.system()} {platform.release()}"
+    yield "Python", "ok", f"{platform.python_version()}, {sys.executable}, on {system}", ""
     wrong = _wrong("")
     for package, reason in wrong.items():
-        yield Check(package, "broken", reason, f'pip install "{package}"')
+        yield package, "broken", reason, f'pip install "{package}"'
     for module, package in COMPILED.items():
-        if package in wrong:
-            continue
-        found, reason = _run(f"import {module}") if deep else ("", "")
-        version = f"{metadata.version(package)}{'' if deep else ', not loaded'}"
-        remedy = f"install {package} again" if reason else ""
-        yield Check(module, "broken" if reason else "ok", reason or found or version, remedy)
-
-
-def _extras() -> Iterator[Check]:
+        if package not in wrong:
+            version = f"{metadata.version(package)}{'' if deep else ', not loaded'}"
+            reason = _run(f"import {module}")[1] if deep else ""
+            yield module, "broken", reason or version, reason and f"install {package} again"
     for extra, entry in EXTRAS.items():
         wrong = _wrong(extra)
-        found = "; ".join([entry.purpose, *wrong.values()])
         remedy = f'pip install "retwin[{extra}]"' if wrong else ""
-        yield Check(extra, "missing" if wrong else "ok", found, remedy)
+        yield extra, "missing", "; ".join([entry.purpose, *wrong.values()]), remedy
 
 
 def _wrong(extra: str) -> dict[str, str]:
     """The packages that retwin, or an extra of it, lacks or has in a wrong version, and why."""
     wrong = {}
     for each in map(Requirement, metadata.requires("retwin") or ()):
-        marker = each.marker
-        always = marker is None or marker.evaluate({"extra": ""})
-        if always == bool(extra) or not (always or marker.evaluate({"extra": extra})):  # type: ignore[union-attr]
+        needed = [each.marker is None or each.marker.evaluate({"extra": x}) for x in ("", extra)]
+        if needed != [not extra, True]:
             continue
         try:
             version = metadata.version(each.name)
@@ -152,57 +105,45 @@ def _wrong(extra: str) -> dict[str, str]:
 
 def _run(code: str) -> tuple[str, str]:
     """What code prints in a Python process of its own, and why it failed; "" if it did not."""
+    words = [sys.executable, "-c", code]
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, timeout=IMPORT_TIMEOUT
-        )
+        done = subprocess.run(words, capture_output=True, text=True, timeout=IMPORT_TIMEOUT)
     except subprocess.TimeoutExpired:
         return "", f"no end after {IMPORT_TIMEOUT:g} s"
-    # Without a message the process was killed, by a signal that the code names.
-    lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-    # The message, which may take several lines, follows the traceback, whose lines are indented.
-    frames = [place for place, line in enumerate(lines) if line.startswith(" ")]
-    reason = " ".join(lines[frames[-1] + 1 if frames else 0 :])
+    # Of a traceback only the message, which may take several lines, is not indented.
+    lines = [x for x in done.stderr.splitlines() if x and not x.startswith((" ", "Traceback"))]
+    reason = " ".join(lines) or f"exit code {done.returncode}"
     return done.stdout.strip(), reason if done.returncode else ""
 
 
-def _machine(deep: bool) -> Iterator[Check]:
-    yield Check("system", "ok", f"{platform.system()} {platform.release()}")
+def _machine(deep: bool) -> Iterator[Found]:
+    """Cores, memory and graphics."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    given = os.environ.get("OMP_NUM_THREADS", "")
-    if given.isdecimal() and int(given) > (cores or 1):
-        remedy = f"OMP_NUM_THREADS={cores}: more threads than cores cost several times the time"
-        yield Check("cores", "warning", f"{cores}; {given} threads", remedy)
-    else:
-        yield Check("cores", "ok", f"{cores} for this process")
+    threads = os.environ.get("OMP_NUM_THREADS", "")
+    many = threads.isdecimal() and int(threads) > (cores or 1)
+    remedy = f"OMP_NUM_THREADS={cores}: more threads than cores cost several times the time"
+    yield "cores", "warning", f"{cores} for this process", remedy if many else ""
     total, free = memory()
-    if total:
-        fits = max(1, free // BYTES_PER_PROCESS)
-        scarce = fits < (cores or 1)
-        remedy = f"a study takes about 1 GB per process: give it --processes {fits}"
-        found = f"{free / 2**30:.1f} GB free of {total / 2**30:.1f}"
-        yield Check("memory", "warning" if scarce else "ok", found, remedy if scarce else "")
+    fits = max(1, free // BYTES_PER_PROCESS)
+    found = f"{free / 2**30:.1f} GB free of {total / 2**30:.1f}" if total else "not stated"
+    remedy = f"a study takes about 1 GB per process: give it --processes {fits}"
+    yield "memory", "warning", found, remedy if total and fits < (cores or 1) else ""
     found, reason = _run(GPU) if deep else ("not checked, and none is needed; --deep does", "")
-    lacking = "install torch again" if reason else ""
-    yield Check("GPU", "missing" if reason else "ok", found or reason, lacking)
+    yield "GPU", "missing", found or reason, reason and "install torch again"
 
 
-def _data() -> Iterator[Check]:
+def _data() -> Iterator[Found]:
+    """The real and the public data."""
     named = os.environ.get("RETWIN_DATA", "")
-    if Path(named).is_dir() and named:
-        yield Check("RETWIN_DATA", "ok", named)
-    else:
-        found = f"{named or 'not set'}: demo and tests use an emulated robot"
-        yield Check("RETWIN_DATA", "missing", found, "set it to a folder of real data")
+    there = bool(named) and Path(named).is_dir()
+    found = named if there else f"{named or 'not set'}: demo and tests use an emulated robot"
+    yield "RETWIN_DATA", "missing", found, "" if there else "set it to a folder of real data"
     try:
         cache = cache_folder()
     except InputError as error:
-        yield Check("cache", "missing", error.got, error.remedy)
+        yield "cache", "missing", error.got, error.remedy
         return
     for name, known in DOWNLOADS.items():
-        file = cache / known.file
-        if file.is_file():
-            yield Check(f"public {name}", "ok", str(file))
-        else:
-            get = f"retwin data fetch {name}"
-            yield Check(f"public {name}", "missing", f"not in {cache}", get)
+        there = (cache / known.file).is_file()
+        found = str(cache / known.file) if there else f"not in {cache}"
+        yield f"public {name}", "missing", found, "" if there else f"retwin data fetch {name}"

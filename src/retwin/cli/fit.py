@@ -16,7 +16,7 @@ from retwin.checks import one_of as in_catalog
 from retwin.cli.completion import one_of
 from retwin.cli.options import CaseArgument, Horizon, Json, LogMapping, MaxBytes, Seed, seconds_of
 from retwin.cli.reading import read
-from retwin.cli.terminal import answer, bar, note, table
+from retwin.cli.terminal import Interrupted, answer, bar, note, table
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.places import check_place
 
@@ -196,7 +196,11 @@ def _carry_out(
         found.save(out, page=fit_page(found, str(out), title=system.title))
         if yardstick:
             note(f"Saved {out}; now models without the twin, to be compared with")
-            found = with_yardstick(found, seed=seed, progress=lambda s: show("yardstick", s))
+            try:
+                found = with_yardstick(found, seed=seed, progress=lambda s: show("yardstick", s))
+            except KeyboardInterrupt:
+                kept = f"{out} stays as it was saved, not compared with models without the twin"
+                raise Interrupted(kept) from None
             found.save(out, page=fit_page(found, str(out), title=system.title))
     return found, base
 

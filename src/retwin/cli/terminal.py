@@ -269,12 +269,12 @@ def complain_of_usage(error: Any) -> None:
         complain(f"{text}{where}")
 
 
-def complain_of_interruption(*, kept: bool) -> None:
-    """Print a line after Ctrl-C; `kept` if the same command resumes the work."""
+def complain_of_interruption(kept: str = "") -> None:
+    """Print a line after Ctrl-C: what is `kept`, or that nothing is."""
     # Zarr's event loop would log what was interrupted when the process ends.
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
-    how = "to go on" if kept else "to begin anew, nothing is left half-written"
-    complain(f"interrupted; give the same command again {how}: {command_given()}")
+    anew = "give the same command again to begin anew, nothing is left half-written"
+    complain(f"interrupted; {kept or f'{anew}: {command_given()}'}")
 
 
 def described(error: Exception) -> str:
@@ -286,7 +286,7 @@ def described(error: Exception) -> str:
 
 
 class Interrupted(Exception):
-    """Ctrl-C in work that the same command resumes."""
+    """Ctrl-C in work of which something is kept; the message says what."""
 
 
 @contextmanager
@@ -295,7 +295,8 @@ def resumable() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        raise Interrupted from None
+        again = f"give the same command again to go on: {command_given()}"
+        raise Interrupted(again) from None
 
 
 @contextmanager

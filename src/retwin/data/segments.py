@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import require
 from retwin.errors import InputError
-from retwin.threads import in_threads
 from retwin.times import sample_rate
+from retwin.workers.threads import in_threads
 
 TRAJECTORIES_PER_BLOCK = 32
 """Trajectories per pass over the commands, few enough that their samples fit the cache."""

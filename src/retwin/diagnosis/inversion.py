@@ -32,7 +32,6 @@ from retwin.inference.noise import Noise
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
-from retwin.threads import one_thread
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.twin import Twin
 from retwin.update.corrections.missed_segments import CommandFit
@@ -40,6 +39,7 @@ from retwin.update.exact import exact_surrogate, load_surrogate
 from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
 from retwin.update.training_range import outside_training
+from retwin.workers.threads import one_thread
 
 TRAJECTORIES_PER_BATCH = 16
 """Trajectories inverted together, which bounds memory."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from retwin.arrays import held
 from retwin.data.trajectories import Trajectories
-from retwin.monitor.samples import SECOND
+from retwin.monitor.samples import SECOND, places
 from retwin.monitor.store import Store
 from retwin.monitor.updates import EARLIEST
 from retwin.update.dynamics.twin import DynamicsTwin
@@ -51,9 +51,7 @@ def gridded(
     if not len(found):
         return found, given
     period = SECOND / twin.rate
-    place, chosen = np.unique(
-        np.round((found - found[0]) / period).astype(np.int64), return_index=True
-    )
+    place, chosen = places(found, found[0], twin.rate)
     inside = place <= (last - first) / period
     rows = np.full((int(place[inside][-1]) + 1, given.shape[1]), np.nan)
     rows[place[inside]] = given[chosen[inside]]

@@ -35,11 +35,11 @@ from retwin.monitor.settings import (
     secret,
 )
 from retwin.monitor.sources.folder import Folder
-from retwin.monitor.sources.mapped_tables import MappedLayout, mapped_layout
+from retwin.monitor.sources.layouts import layout_of, mapped_layout
 from retwin.monitor.sources.mqtt import Mqtt
 from retwin.monitor.sources.opcua import OpcUa
 from retwin.monitor.sources.source import Source
-from retwin.monitor.sources.tables import Layout, layout_of
+from retwin.monitor.sources.tables import Layout
 from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
 from retwin.monitor.store import Store
 from retwin.monitor.trajectories import TrajectoryMonitor
@@ -236,7 +236,7 @@ def _folders(
     cases_ = {name: systems[asset.twin] for name, asset in whole.assets.items()}
     newest = {each.asset: each.time for each in live.status() if each.time is not None}
     mapping = None if settings.mapping is None else read_mapping(settings.mapping)
-    layouts: dict[str, Layout | MappedLayout] = {}
+    layouts: dict[str, Layout] = {}
     recorded: dict[str, Recorded] = {}
     for name in [settings.asset] if settings.asset else whole.assets:
         monitor = live.monitor(name)
@@ -250,12 +250,12 @@ def _folders(
                 got=settings.files,
                 remedy="give tables of samples, since its monitor watches no whole trajectories",
             )
-            if mapping is None:
-                layouts[name] = layout_of(settings, live.channels(name), cases_[name])
-            else:
-                twin = monitor.twin
-                channels = (twin.inputs, twin.outputs, twin.rate)
-                layouts[name] = mapped_layout(mapping, *channels, cases_[name])
+            twin, case = monitor.twin, cases_[name]
+            layouts[name] = (
+                layout_of(settings, live.channels(name), case)
+                if mapping is None
+                else mapped_layout(mapping, twin.inputs, twin.outputs, twin.rate, case)
+            )
     made: list[Source] = []
     if layouts:
         made.append(Folder(settings, layouts, newest, report))

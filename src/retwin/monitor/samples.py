@@ -90,6 +90,14 @@ class Trajectory:
         return Samples(self.asset, np.array(times, dtype=np.int64), self.values)
 
 
+def places(times: NDArray, begin: int, rate: float) -> tuple[NDArray, NDArray]:
+    """Places from `begin` on at a rate in Hz that times (n,) in ns are nearest to, each once in
+    order, and the first time of each.
+    """
+    place = np.round((times - begin) * (rate / SECOND)).astype(np.int64)
+    return np.unique(place, return_index=True)
+
+
 def parse(
     document: bytes | str, channels: Callable[[str], Sequence[str]], asset: str | None = None
 ) -> list[Samples | Trajectory]:

@@ -12,8 +12,10 @@ from torch import Tensor, nn
 from torch.distributions import (
     Categorical,
     Distribution,
+    Independent,
     MixtureSameFamily,
     MultivariateNormal,
+    Normal,
     constraints,
 )
 
@@ -44,11 +46,14 @@ class GaussianMixture(MixtureSameFamily):
     def __init__(self, logits: Tensor, mean: Tensor, factor: Tensor) -> None:
         self.means = mean
         self.factor = factor
-        super().__init__(
-            Categorical(logits=logits, validate_args=False),
-            MultivariateNormal(mean, scale_tril=factor, validate_args=False),
-            validate_args=False,
-        )
+        components: Distribution
+        if mean.shape[-1] == 1:  # much faster than to invert matrices of one element
+            alone = Normal(mean, factor[..., 0], validate_args=False)
+            components = Independent(alone, 1, validate_args=False)
+        else:
+            components = MultivariateNormal(mean, scale_tril=factor, validate_args=False)
+        weights = Categorical(logits=logits, validate_args=False)
+        super().__init__(weights, components, validate_args=False)
 
     def expand(
         self, batch_shape: Sequence[int], _instance: Distribution | None = None
@@ -284,13 +289,16 @@ class MixtureHead(nn.Module):
 
     def forward(self, encoded: Tensor, shift: Tensor, scale: Tensor) -> GaussianMixture:
         """The mixture of z for contexts (..., H); `shift` and `scale` (D,) are its units."""
-        raw = self.linear(encoded).unflatten(-1, (self.components, -1))
+        return self.mixture(self.linear(encoded), shift, scale)
+
+    def mixture(self, raw: Tensor, shift: Tensor, scale: Tensor) -> GaussianMixture:
+        """The mixture of outputs `raw` (..., K (1 + D + D (D + 1) / 2)) of the linear layer."""
+        raw = raw.unflatten(-1, (self.components, -1))
         logits, mean, lower = raw.split([1, self.width, self.lower], dim=-1)
         factor = raw.new_zeros(*raw.shape[:-1], self.width, self.width)
         row, column = torch.tril_indices(self.width, self.width, device=raw.device)
-        factor[..., row, column] = lower
-        diagonal = nn.functional.softplus(factor.diagonal(dim1=-2, dim2=-1)) + FLOOR
-        factor = factor.tril(-1) + torch.diag_embed(diagonal)
+        positive = nn.functional.softplus(lower) + FLOOR
+        factor[..., row, column] = torch.where(row == column, positive, lower)
         return GaussianMixture(logits[..., 0], mean * scale + shift, scale[:, None] * factor)
 
     @torch.no_grad()

@@ -23,7 +23,7 @@ from torch.utils.data import (
 
 from retwin.checks import finite, one_of, positive, whole
 from retwin.progress import Progress
-from retwin.threads import one_thread
+from retwin.workers.threads import one_thread
 
 Loss = Callable[[Any, tuple[Tensor, ...]], Tensor]
 """A function of the network and a batch whose value is the mean loss over the examples."""

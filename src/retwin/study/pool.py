@@ -16,11 +16,11 @@ from graphlib import TopologicalSorter
 from typing import Any
 
 from retwin.checks import require
-from retwin.jobs import on_cluster
-from retwin.processes import worker_pool
 from retwin.study.files import Job
 from retwin.study.progress import Stages
 from retwin.study.work import Work
+from retwin.workers.jobs import on_cluster
+from retwin.workers.pools import worker_pool
 
 _messages: Any = None
 """Queue to the parent process, set in each worker when it starts."""

@@ -17,8 +17,8 @@ from scipy.signal import windows
 from retwin.arrays import floats, row_blocks
 from retwin.checks import one_per
 from retwin.data.trajectories import Channels
-from retwin.threads import in_threads
 from retwin.twins.compiled import commands as compiled_commands
+from retwin.workers.threads import in_threads
 
 TOLERANCE = 0.02
 """How far a value may leave its range, as a share of the range's width."""

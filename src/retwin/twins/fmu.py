@@ -10,8 +10,8 @@ import os
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -21,12 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import positive, require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.isolation import IsolatedPool, ProcessEnded, isolated_pool
-from retwin.processes import scratch_folder
 from retwin.progress import Progress
 from retwin.times import sample_rate
-from retwin.twins import fmu_worker
 from retwin.twins.faults import Fault
+from retwin.twins.fmu_instance import Outcome, RunSettings, Start
 from retwin.twins.fmu_model import (
     channels_of,
     extract,
@@ -39,9 +37,14 @@ from retwin.twins.limits import Limits
 from retwin.twins.time_step import steps_per_sample
 from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks
 from retwin.twins.workers import worker_processes
+from retwin.workers.isolation import IsolatedPool
+from retwin.workers.pools import scratch_folder
+from retwin.workers.process import Frame, ProcessEnded
 
 TRAJECTORIES_PER_CHUNK = 256
 """Number of trajectories per chunk: it bounds the tasks that wait for a process."""
+TASKS = "retwin.twins.fmu_worker"
+"""The module of the tasks of its processes."""
 FORGETS = (
     "its reset does not restore the initial state, so every run has a new instance; reuse=False "
     "makes them at once"
@@ -53,9 +56,8 @@ class FMUTwin:
     """A functional mock-up unit, run in worker processes, since it may hang or crash.
 
     `FMUTwin.from_file` makes one with names, units and limits from the FMU. Each process loads the
-    FMU once and resets it between runs; see also `keep_workers`. A script that simulates must do
-    so under `if __name__ == "__main__":`. A run depends neither on the runs before it nor on the
-    number of processes: see `reuse`.
+    FMU once and resets it between runs; see also `keep_workers`. A run depends neither on the runs
+    before it nor on the number of processes: see `reuse`.
 
     Parameters
     ----------
@@ -279,7 +281,7 @@ class FMUTwin:
 
     def _workers(self, count: int) -> AbstractContextManager[IsolatedPool]:
         """Processes that have loaded the FMU, for `count` trajectories."""
-        job = fmu_worker.RunSettings(
+        job = RunSettings(
             inputs=self.inputs.names,
             outputs=self.outputs.names,
             rate=self.rate,
@@ -293,12 +295,12 @@ class FMUTwin:
         return worker_processes((version, job, workers), lambda: self._start(job, workers))
 
     @contextmanager
-    def _start(self, job: fmu_worker.RunSettings, workers: int) -> Iterator[IsolatedPool]:
+    def _start(self, job: RunSettings, workers: int) -> Iterator[IsolatedPool]:
         """Start the processes on an unpacked FMU, which is removed when they end."""
-        begin, orphaned = fmu_worker.start, fmu_worker.orphaned
         with scratch_folder() as folder:
             extract(self.path, folder)
-            with isolated_pool(workers, begin, (folder, job), orphaned=orphaned) as pool:
+            about = {"folder": folder, "settings": asdict(job)}
+            with closing(IsolatedPool(workers, folder, f"{TASKS}:start", about)) as pool:
                 self._check_loads(pool)
                 yield pool
 
@@ -306,7 +308,7 @@ class FMUTwin:
         self,
         pool: IsolatedPool,
         chunk: Chunk,
-        values: Sequence[fmu_worker.Start],
+        values: Sequence[Start],
         report: Callable[[float], None],
         ended: dict[int, float],
     ) -> tuple[NDArray, NDArray]:
@@ -342,33 +344,32 @@ class FMUTwin:
         nominal[~changed] = observed[~changed]
         return nominal, observed
 
-    def _schedule(
-        self, pool: IsolatedPool, commands: NDArray, values: fmu_worker.Start
-    ) -> Future[fmu_worker.Outcome]:
+    def _schedule(self, pool: IsolatedPool, commands: NDArray, values: Start) -> Future[Frame]:
         """The outcome of one run, in the future."""
         size = 8 * len(commands) * len(self.outputs)
-        return pool.schedule(fmu_worker.run, commands, values, timeout=self.timeout, size=size)
+        task = f"{TASKS}:run"
+        return pool.schedule(task, values, [commands], timeout=self.timeout, size=size)
 
-    def _outcome(self, future: Future[fmu_worker.Outcome]) -> fmu_worker.Outcome:
+    def _outcome(self, future: Future[Frame]) -> Outcome:
         """The outcome of a run, also of one that harmed its process."""
         try:
-            return future.result()
+            about, (outputs,) = future.result()
+            return Outcome(outputs, **about)
         except TimeoutError:
-            return fmu_worker.Outcome(reason=f"hung for more than {self.timeout:g} s")
+            return Outcome(reason=f"hung for more than {self.timeout:g} s")
         except ProcessEnded as error:
-            return fmu_worker.Outcome(reason=str(error))
+            return Outcome(reason=str(error))
 
     def _check_loads(self, pool: IsolatedPool) -> None:
         """Refuse an FMU that cannot be loaded, once instead of in every run."""
         remedy = "export it for this system; see that what it needs is installed"
         try:
-            reason = pool.schedule(fmu_worker.load, timeout=self.timeout, size=0).result()
+            task = f"{TASKS}:load"
+            reason = pool.schedule(task, None, timeout=self.timeout, size=0).result()[0]
         except TimeoutError:
             reason = f"it hung for more than {self.timeout:g} s"
         except ProcessEnded as error:
             reason = str(error)
-            # A process that imports a script without this line simulates in its turn, and ends.
-            remedy += "; in a script simulate under `if __name__ == '__main__':`"
         require(
             not reason,
             "path",

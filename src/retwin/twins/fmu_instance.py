@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.isolation import Retired, more_time
 from retwin.twins.fmu_access import Access
 from retwin.twins.fmu_model import find_scalars
+from retwin.workers.process import Retired, more_time
 
 MAX_INSTANCES = 500
 """Largest number of instances that one process makes. Some FMUs crash at about the thousandth."""

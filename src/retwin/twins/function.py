@@ -17,16 +17,22 @@ from pebble import ProcessExpired, ProcessPool
 from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
-from retwin.processes import sendable_errors, worker_pool
 from retwin.progress import Progress
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, simulate_in_chunks
 from retwin.twins.workers import worker_processes
+from retwin.workers.pools import check_sendable, sendable_errors, worker_pool
 
 TRAJECTORIES_PER_CHUNK = 128
 """Number of trajectories that a vectorised function gets at once."""
+
+IMPORTABLE = {
+    "expected": "a function that worker processes can import",
+    "remedy": "define it in a module of its own, or give workers=1",
+}
+"""Parts of the error for another function."""
 
 Function = Callable[..., ArrayLike]
 
@@ -107,8 +113,8 @@ class FunctionTwin:
             remedy="leave workers out, or give vectorised=False",
         )
         if self.workers > 1:
-            _check_importable(self.function, "function")
-            _check_importable(self.nominal, "nominal")
+            check_sendable(self.function, "function", **IMPORTABLE)
+            check_sendable(self.nominal, "nominal", **IMPORTABLE)
 
     def simulate(
         self,
@@ -300,27 +306,9 @@ def _in_worker(pickled: bytes, role: str) -> NDArray:
     try:
         call = pickle.loads(pickled)
     except (AttributeError, ImportError) as error:
-        raise _not_importable(role, str(error)) from error
+        raise InputError(role, got=" ".join(str(error).split()), **IMPORTABLE) from error
     with sendable_errors():
         return call.outputs_of()
-
-
-def _check_importable(function: Function | None, role: str) -> None:
-    """Refuse a function that cannot be pickled."""
-    try:
-        pickle.dumps(function)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise _not_importable(role, str(error)) from error
-
-
-def _not_importable(role: str, reason: str) -> InputError:
-    """The error for a function that worker processes cannot import."""
-    return InputError(
-        role,
-        expected="a function that worker processes can import",
-        got=" ".join(reason.split()),
-        remedy="define it in a module of its own, or give workers=1",
-    )
 
 
 def _takes(function: Function, name: str) -> bool:

@@ -5,22 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 Pool = TypeVar("Pool")
 
-
-@dataclass(frozen=True, eq=False)
-class _Kept:
-    """A pool that is kept: the twin settings that it serves, and what ends it."""
-
-    key: object
-    pool: Any
-    stack: ExitStack
-
-
-_KEPT: ContextVar[list[_Kept] | None] = ContextVar("kept_worker_processes", default=None)
+_KEPT: ContextVar[dict[str, tuple[Any, ExitStack]] | None] = ContextVar("kept", default=None)
+"""Pools that are kept, by what they depend on, and what ends them."""
 
 
 @contextmanager
@@ -34,15 +24,15 @@ def keep_workers() -> Iterator[None]:
     if _KEPT.get() is not None:
         yield
         return
-    kept: list[_Kept] = []
-    token = _KEPT.set(kept)
-    try:
-        yield
-    finally:
-        _KEPT.reset(token)
-        with ExitStack() as stack:
-            for each in kept:
-                stack.push(each.stack)
+    with ExitStack() as stack:
+        kept: dict[str, tuple[Any, ExitStack]] = {}
+        token = _KEPT.set(kept)
+        try:
+            yield
+        finally:
+            _KEPT.reset(token)
+            for _, each in kept.values():
+                stack.push(each)
 
 
 @contextmanager
@@ -54,7 +44,8 @@ def worker_processes(
     Parameters
     ----------
     key : object
-        Whatever the pool depends on; pools of equal keys can stand in for each other.
+        Whatever the pool depends on, which its `repr` shows; pools of equal keys can stand in for
+        each other.
     start : callable
         Opens the pool; without `keep_workers` it is closed when the block ends.
 
@@ -64,19 +55,16 @@ def worker_processes(
         The running pool. An exception in the block ends it, and with it all pending tasks.
 
     """
-    kept = _KEPT.get()
+    kept, name = _KEPT.get(), repr(key)
     if kept is None:
         with start() as pool:
             yield pool
         return
-    found = next((each for each in kept if each.key == key), None)
-    if found is None:
+    if name not in kept:
         stack = ExitStack()
-        found = _Kept(key, stack.enter_context(start()), stack)
-        kept.append(found)
+        kept[name] = stack.enter_context(start()), stack
     try:
-        yield found.pool
+        yield kept[name][0]
     except BaseException as error:
-        kept[:] = [each for each in kept if each is not found]
-        found.stack.__exit__(type(error), error, error.__traceback__)
+        kept.pop(name)[1].__exit__(type(error), error, error.__traceback__)
         raise

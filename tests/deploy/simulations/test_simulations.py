@@ -27,13 +27,13 @@ from retwin import twins
 from retwin.data.io.zarr_folder import read_header, read_zarr
 from retwin.deploy.simulations import Simulated, SimulationPlan, simulate_to
 from retwin.deploy.simulations.job import _check_same
-from retwin.jobs import alone
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256
 from retwin.serialisation.identity import identity
 from retwin.twins.collected import SimulationError
 from retwin.twins.samplers import RampSampler
 from retwin.twins.twin import Chunk, simulate_in_chunks
+from retwin.workers.jobs import alone
 
 FAULTS = {"Healthy": None, "Stuck": rt.Stuck(0, 0.3), "Biased": rt.ActuatorBias(1, (10.0, 50.0))}
 SAMPLER = RampSampler((0.0, 0.0), (100.0, 100.0), 10.0, 3.0, segments=2, ramp_durations=(0.3, 0.5))

@@ -32,7 +32,7 @@ from retwin.cases.animation.shots import (
 )
 from retwin.checks import require
 from retwin.errors import InputError, brief
-from retwin.processes import worker_pool
+from retwin.workers.pools import worker_pool
 
 if TYPE_CHECKING:
     from retwin.cases.case import Body

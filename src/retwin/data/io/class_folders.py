@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-import warnings
+from array import array
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.io.assembly import DataCase, Raw, assemble
-from retwin.data.io.mat import mat_variables, matrix
-from retwin.data.io.mat5 import Opaque
+from retwin.data.io.mat import mat_reader, mat_variables, matrix
 from retwin.data.trajectories import Channels, Provenance, Trajectories
-from retwin.errors import InputError, brief
+from retwin.errors import InputError
 from retwin.progress import Progress, tracked
 from retwin.serialisation.files import sha256
 from retwin.serialisation.sizes import Budget
+from retwin.workers.reader import FileReader
 
-Reader = Callable[[Path, str, "DataCase | None", Budget], Raw]
+Reader = Callable[[Path, str, "DataCase | None", Budget, FileReader], Raw]
 COORDINATES = 3
 """Outputs per sample in the arm's authors' files: x, y and z."""
 VARIABLES = ("trajCmds", "trajResps", "dataset", "motorCmdsRadius")
@@ -68,16 +68,17 @@ def read_class_folders(
     )
     files, read = found[0]
     raws, budget = [], Budget(path.name, max_bytes)
-    for file in tracked(files, len(files), progress):
-        where = f"{file.parent.name}/{file.name}"
-        require(
-            file.is_file(),
-            where,
-            expected="a regular file",
-            got="a pipe, a device or a folder",
-            remedy="keep nothing else of that name there",
-        )
-        raws.append(read(file, where, case, budget))
+    with mat_reader() as reader:
+        for file in tracked(files, len(files), progress):
+            where = f"{file.parent.name}/{file.name}"
+            require(
+                file.is_file(),
+                where,
+                expected="a regular file",
+                got="a pipe, a device or a folder",
+                remedy="keep nothing else of that name there",
+            )
+            raws.append(read(file, where, case, budget, reader))
     raws, inputs = _commands_of_case(raws, case, radians=read is _read_dataset)
     return assemble(
         raws,
@@ -102,57 +103,43 @@ def _in_order(path: Path, pattern: str) -> list[Path]:
     return sorted(files, key=key)
 
 
-def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget) -> Raw:
+def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget, _: FileReader) -> Raw:
     with file.open("rb") as blocks:
         for part in iter(lambda: blocks.read(BYTES_PER_BLOCK), b""):
             numbers = 1 + part.count(b",") + part.count(b"\n")
             budget.take(max(BYTES_PER_NUMBER * numbers, len(part)))  # a line may be a whole file
-    try:
-        with file.open(encoding="utf-8-sig") as lines, warnings.catch_warnings():
-            warnings.simplefilter("error")  # numpy only warns when there is no row at all
-            block = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
-    except Exception as error:
-        raise _csv_error(file, where, brief(error)) from None
-    label = file.parent.name
-    return Raw.of_columns(block, where, case, label, f"{label}/{file.stem}")
-
-
-def _csv_error(file: Path, where: str, fallback: str) -> InputError:
-    """The error that names the first bad line of a CSV file, `fallback` if no line is bad."""
-    got, width = None, 0
+    label, values, width, got = file.parent.name, array("d"), 0, "no rows"
     with file.open(encoding="utf-8-sig", errors="replace") as lines:
         for number, line in enumerate(lines, start=1):
-            if not line.strip():
-                continue
             fields = line.strip().split(",")
-            bad = [field for field in fields if not _is_number(field)]
-            if bad:
-                got = f"{bad[0].strip()[:40]!r} in line {number}"
+            if fields == [""]:
+                continue
+            width, got, before = width or len(fields), "", len(values)
+            try:
+                values.extend(map(float, fields))
+            except ValueError:  # at the first field that is no number
+                bad = fields[len(values) - before].strip()[:40]
+                got = f"{bad!r} in line {number}"
                 break
-            width = width or len(fields)
             if len(fields) != width:
                 got = f"{len(fields)} columns in line {number} after {width} before"
                 break
-    got = got or (fallback if width else "no rows")
-    return InputError(
+    require(
+        not got,
         where,
         expected="rows of numbers with commas between, all of one length, without a header",
         got=got,
         remedy="repair that line ('nan' stands for a missing measurement)",
     )
+    block = np.frombuffer(values).reshape(-1, width)
+    return Raw.of_columns(block, where, case, label, f"{label}/{file.stem}")
 
 
-def _is_number(field: str) -> bool:
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
-
-
-def _read_dataset(file: Path, where: str, case: DataCase | None, budget: Budget) -> Raw:
+def _read_dataset(
+    file: Path, where: str, case: DataCase | None, budget: Budget, reader: FileReader
+) -> Raw:
     width = len(case.outputs) if case is not None else COORDINATES
-    paths = mat_variables(file, budget, VARIABLES)
+    paths = mat_variables(file, budget, reader, VARIABLES)
     if {"trajCmds", "trajResps"} <= set(paths):
         nominal = _upright(paths["trajCmds"], width, f"{where}: trajCmds")
         observed = _upright(paths["trajResps"], width, f"{where}: trajResps")
@@ -165,7 +152,7 @@ def _read_dataset(file: Path, where: str, case: DataCase | None, budget: Budget)
         raise InputError(
             where,
             expected="the variables trajCmds and trajResps, or dataset",
-            got=", ".join(sorted(mat_variables(file, budget))) or "none",
+            got=", ".join(sorted(mat_variables(file, budget, reader))) or "none",
             remedy="give the folder of the authors' data as it is",
         )
     require(
@@ -198,7 +185,7 @@ def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None,
     A table of numbers, or a cell per motor with a vector or with a struct of `Data` and `Time`.
     """
     where = f"{where}: motorCmdsRadius"
-    if value is None or isinstance(value, Opaque):
+    if value is None:
         return None, None
     cells = np.asarray(value)
     if cells.dtype != object:
@@ -227,7 +214,7 @@ def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None,
 
 def _series(cell: Any, where: str) -> tuple[NDArray | None, float | None]:
     """Values (T,) and sample rate (Hz) of one motor; None for what cannot be decoded."""
-    if isinstance(cell, Opaque):
+    if cell is None:
         return None, None
     data = _vector(cell.get("Data") if isinstance(cell, dict) else cell, where)
     if not isinstance(cell, dict) or "Time" not in cell:

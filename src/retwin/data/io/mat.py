@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.io.assembly import DataCase, Raw, assemble
-from retwin.data.io.mat5 import NewerMat, read_mat5
 from retwin.data.trajectories import Provenance, Trajectories
 from retwin.errors import InputError
-from retwin.serialisation.files import check_regular, refusing, sha256
+from retwin.serialisation.files import check_regular, sha256
 from retwin.serialisation.sizes import Budget
+from retwin.workers.process import Frame
+from retwin.workers.reader import FileReader
 
 PAIRS = (("X_array", "y_array"), ("X_test_array", "y_test_array"))
 """The names of the variables that hold trajectories and class names."""
@@ -42,7 +43,8 @@ def read_mat(
 
     """
     budget = Budget(path.name, max_bytes)
-    variables = mat_variables(path, budget)
+    with mat_reader() as reader:
+        variables = mat_variables(path, budget, reader)
     found = [pair for pair in PAIRS if set(pair) <= set(variables)]
     require(
         len(found) == 1,
@@ -71,8 +73,21 @@ def read_mat(
     return assemble(raws, source=source, case=case, rate=rate, budget=budget)
 
 
-def mat_variables(path: Path, budget: Budget, names: Sequence[str] | None = None) -> dict[str, Any]:
-    """The variables of a MAT file (those in `names`), as `read_mat5` gives them.
+def mat_reader() -> FileReader:
+    """A process that reads MAT files, since scipy trusts the sizes in them: one flipped bit may
+    end its process.
+    """
+    task = f"{__name__}:send_variables"
+    return FileReader(task, expected="a readable MAT file", remedy="get the file again")
+
+
+def mat_variables(
+    path: Path, budget: Budget, reader: FileReader, names: Sequence[str] | None = None
+) -> dict[str, Any]:
+    """The variables of a MAT file (those in `names`).
+
+    Numbers are arrays, texts arrays of str (one per row), cells object arrays, a struct a dict (an
+    array of structs an object array), and anything else is None.
 
     Raises
     ------
@@ -80,18 +95,66 @@ def mat_variables(path: Path, budget: Budget, names: Sequence[str] | None = None
         The file is damaged, of version 7.3 (HDF5), or larger than the budget.
 
     """
-    expected = "a readable MAT file"
-    with refusing(path.name, expected=expected, remedy="get the file again"):
-        budget.take(path.stat().st_size)
-        try:
-            return read_mat5(check_regular(path).read_bytes(), budget, names)
-        except NewerMat:
-            raise InputError(
-                path.name,
-                expected="a MAT file of version 5 to 7",
-                got="one of version 7.3 (HDF5) or newer",
-                remedy="save it in MATLAB with the option '-v7'",
-            ) from None
+    size = check_regular(path).stat().st_size
+    budget.take(size)
+    request = {"path": str(path.resolve()), "names": None if names is None else list(names)}
+    frames = reader.read(request, path.name, size, budget)
+    return {name: _unpack(tree, iter(arrays)) for (name, tree), arrays in frames}
+
+
+def send_variables(request: dict[str, Any]) -> Iterator[Frame]:
+    """The task of `mat_reader`: the name of each variable, what it consists of, and its numbers."""
+    from scipy.io import loadmat
+
+    path = Path(request["path"])
+    try:
+        found = loadmat(path, variable_names=request["names"])
+    except NotImplementedError:  # scipy's error for HDF5
+        raise InputError(
+            path.name,
+            expected="a MAT file of version 5 to 7",
+            got="one of version 7.3 (HDF5) or newer",
+            remedy="save it in MATLAB with the option '-v7'",
+        ) from None
+    for name, value in found.items():
+        if not name.startswith("__"):
+            arrays: list[NDArray] = []
+            yield (name, _pack(value, arrays)), arrays
+
+
+def _pack(value: Any, arrays: list[NDArray]) -> Any:
+    """What a value of scipy consists of, for JSON; its numbers are added to `arrays`."""
+    if type(value) is not np.ndarray:
+        return None
+    if value.dtype.names is not None:
+        fields = value.dtype.names
+        parts = [
+            ["struct", {name: _pack(each[name], arrays) for name in fields}] for each in value.flat
+        ]
+        return parts[0] if len(parts) == 1 else ["cells", value.shape, parts]
+    if value.dtype == object:
+        return ["cells", value.shape, [_pack(each, arrays) for each in value.flat]]
+    if value.dtype.kind == "U":
+        return ["texts", value.shape, value.ravel().tolist()]
+    arrays.append(value)
+    return ["numbers"]
+
+
+def _unpack(packed: Any, arrays: Iterator[NDArray]) -> Any:
+    """The value of which `_pack` made this."""
+    match packed:
+        case ("numbers",):
+            return next(arrays)
+        case "texts", shape, parts:
+            return np.array(parts, dtype=np.str_).reshape(shape)
+        case "struct", fields:
+            return {name: _unpack(each, arrays) for name, each in fields.items()}
+        case "cells", shape, parts:
+            made = np.empty(len(parts), dtype=object)
+            for i, each in enumerate(parts):
+                made[i] = _unpack(each, arrays)
+            return made.reshape(shape)
+    return None
 
 
 def matrix(value: Any, where: str) -> NDArray:

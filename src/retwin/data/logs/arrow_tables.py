@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import at_most, needs_extra
-from retwin.data.logs.signals import MAX_SIGNALS, UNWANTED, Clock, Signal, Skipped, named_unit
-from retwin.data.logs.tables import table_signals, time_column
+from retwin.data.logs.signals import MAX_SIGNALS, Clock, Signal, Skipped, inside, named_units
+from retwin.data.row_times import time_column
+from retwin.data.tables import Table
 
 FILES = (b"ARROW1", b"FEA1\0\0")
 """How files of Arrow begin that are no streams."""
@@ -22,82 +23,78 @@ MAX_ELEMENTS = 64
 
 
 def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
-    """The signals of a table: its columns of numbers; see `data.logs.signals.Reader`.
+    """The signals of a table: its columns of numbers; see `data.logs.signals.Reader`."""
+    yield from read_table(path, wanted, clock).signals(clock, wanted)
+
+
+def read_table(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Table:
+    """The columns that may be wanted; those that are not have no cells.
 
     Fields of structures are `column.field`, elements of lists of one length `column[0]`. The unit
-    is in the title, or in the metadata of the column under `unit`.
+    is in the title, or in the metadata of the column under `unit`. Titles that are alike but for
+    the unit are names as a whole.
     """
     arrow = needs_extra("pyarrow", "logs", "reads Parquet and Arrow")
     needs_extra("pyarrow.compute", "logs", "takes structures apart")
-    table, left_out = _table(path, arrow, wanted, clock)
-    yield from (Skipped(name, UNWANTED) for name in left_out)
+    table, names = _table(path, arrow, wanted, clock)
     columns: dict[str, Any] = {}
-    units: dict[str, str] = {}
+    units = {n: unit for title, (n, unit) in names.items() if title not in table.column_names}
     for field, column in zip(table.schema, table.columns, strict=True):
-        name, unit = named_unit(field.name)
         about = field.metadata or {}
+        name, unit = names[field.name]
         unit = unit or about.get(b"unit", b"").decode("utf-8", "replace")
         for own, leaf in _leaves(arrow, name, column, 0):
             columns[own], units[own] = leaf, unit
             remedy = "write those that are wanted to a file of their own"
             at_most(path.name, len(columns), MAX_SIGNALS, "columns", remedy=remedy)
 
-    def numeric(name: str) -> tuple[NDArray, int] | str:
-        kind = columns[name].type
-        types = arrow.types
-        if not (
-            types.is_integer(kind)
-            or types.is_floating(kind)
-            or types.is_boolean(kind)
-            or types.is_decimal(kind)
-        ):
-            return f"of type {str(kind)[:40]}"
-        column = columns[name]
-        if types.is_boolean(kind):
+    def cells(name: str) -> NDArray:
+        column, types = columns[name], arrow.types
+        if types.is_boolean(column.type):
             column = column.cast("int8")
-        made = column.cast("double", safe=False).to_numpy()
-        return np.asarray(made, dtype=float), 0
-
-    def stamps(name: str) -> NDArray:
-        column = columns[name]
-        if arrow.types.is_timestamp(column.type):
-            column = column.cast("timestamp[ns]", safe=False).cast("int64")
-            made = column.to_numpy()
-            missing = np.isnan(made) if made.dtype.kind == "f" else np.zeros(len(made), bool)
-            whole = np.where(missing, 0, made).astype("datetime64[ns]")
-            return np.where(missing, np.datetime64("NaT"), whole)
+        elif types.is_decimal(column.type):
+            column = column.cast("double", safe=False)
         return np.asarray(column.to_numpy())
 
-    yield from table_signals(path.name, units, numeric, stamps, table.num_rows, clock, wanted)
+    numeric = ("is_integer", "is_floating", "is_boolean", "is_decimal")
+    others = {
+        name: f"of type {str(column.type)[:40]}"
+        for name, column in columns.items()
+        if not any(getattr(arrow.types, each)(column.type) for each in numeric)
+    }
+    return Table(path.name, units, table.num_rows, cells, others=others)
 
 
 def _table(
     path: Path, arrow: Any, wanted: frozenset[str] | None, clock: Clock
-) -> tuple[Any, list[str]]:
-    """The table with the columns that may be wanted, and the names of the others."""
+) -> tuple[Any, dict[str, tuple[str, str]]]:
+    """The table with the columns that may be wanted; names and units of all by their titles."""
     if path.suffix.lower() == ".parquet":
         parquet = needs_extra("pyarrow.parquet", "logs", "reads Parquet")
         with parquet.ParquetFile(path) as file:
-            titles = {each: named_unit(each)[0] for each in file.schema_arrow.names}
-            if wanted is None:
-                return file.read(), []
+            found = _by_title(file.schema_arrow.names)
             # A wide file has many columns that a mapping does not name.
-            names = {clock.column or time_column(titles.values()), *wanted}
-            kept = [title for title, name in titles.items() if _names(name, names)]
-            others = [name for title, name in titles.items() if title not in kept]
-            return file.read(columns=kept), others
+            names = [name for name, _ in found.values()]
+            some = {clock.column or time_column(names), *(wanted or ())}
+            kept = [
+                title
+                for title, (name, _) in found.items()
+                if wanted is None or any(inside(each, name) for each in some)
+            ]
+            return file.read(columns=kept), found
     with path.open("rb") as stream:
         if stream.read(6) in FILES or path.suffix.lower() == ".feather":
             feather = needs_extra("pyarrow.feather", "logs", "reads Feather")
-            return feather.read_table(path, memory_map=False), []
-        stream.seek(0)
-        with arrow.ipc.open_stream(stream) as batches:
-            return batches.read_all(), []
+            table = feather.read_table(path, memory_map=False)
+        else:
+            stream.seek(0)
+            with arrow.ipc.open_stream(stream) as batches:
+                table = batches.read_all()
+    return table, _by_title(table.column_names)
 
 
-def _names(column: str, names: set[str]) -> bool:
-    """Whether one of the names is that column, or something inside it."""
-    return any(n == column or n.startswith((f"{column}.", f"{column}[")) for n in names)
+def _by_title(titles: Sequence[str]) -> dict[str, tuple[str, str]]:
+    return dict(zip(titles, named_units(titles), strict=True))
 
 
 def _leaves(arrow: Any, name: str, column: Any, depth: int) -> Iterator[tuple[str, Any]]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from retwin.checks import needs_extra
-from retwin.data.logs.messages import Series, Stamps, Types
+from retwin.data.logs.messages import Series, Types
 from retwin.data.logs.signals import Clock, Signal, Skipped
 from retwin.errors import InputError
 
@@ -34,7 +34,7 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
         reader = needs_extra("rosbags.rosbag1", "logs", "reads ROS bags").Reader(path)
     else:
         reader = needs_extra("rosbags.rosbag2", "logs", "reads ROS bags").Reader(path)
-    types, series = Types(), Series(wanted)
+    types, series = Types(), Series(wanted, clock)
     formats = rosbags.MessageDefinitionFormat
     with reader:
         connections = []
@@ -45,29 +45,10 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
                 idl = each.msgdef.format == formats.IDL
                 types.define(each.msgtype, each.msgdef.data, idl=idl)
             connections.append(each)
-        _collect(reader, connections, types, series, clock, ros1=ros1)
+        for each, time, data in reader.messages(connections) if connections else ():
+            decode = partial(types.decode, data, each.msgtype, ros1=ros1)
+            series.add(each.topic, each.msgtype, time, decode)
     yield from series.found()
-
-
-def _collect(
-    reader: Any, connections: list[Any], types: Types, series: Series, clock: Clock, *, ros1: bool
-) -> None:
-    """Decode the messages of some connections."""
-    skipped: set[str] = set()
-    stamped = Stamps(clock, series).time
-    for connection, time, data in reader.messages(connections) if connections else ():
-        topic = connection.topic
-        if topic in skipped:
-            continue
-        try:
-            message = types.decode(data, connection.msgtype, ros1=ros1)
-        except KeyError:
-            skipped.add(topic)
-            reason = f"messages of the type {connection.msgtype}, which the bag does not define"
-            series.skip(topic, reason)
-            continue
-        time = stamped(topic, time, message)
-        series.add(topic, time, message)
 
 
 def _check_database(path: Path) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import require, same_names
 from retwin.data.logs.mapping import ChannelMapping
-from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Log, Signal
+from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Log, Signal, inside
 from retwin.data.logs.units import converted, same_unit
 from retwin.data.measured import stand_in
 from retwin.data.provenance import Sampling
@@ -139,7 +139,8 @@ def _channel(
     default: Resampling,
     period: float,
 ) -> Channel:
-    signal, notes = in_order(_mean_of(log, own.signals), log.name)
+    found = [signal_of(log, each) for each in own.signals]
+    signal, notes = in_order(mean_of(found, log.name), log.name)
     if signal.unreadable:
         one = signal.unreadable == 1
         notes.append(
@@ -152,9 +153,7 @@ def _channel(
             "write NaN, if they stand for missing ones"
         )
     topics = [topic for topic, why in log.skipped.items() if why == NO_STAMP]
-    if any(
-        signal.name == each or signal.name.startswith((f"{each}.", f"{each}[")) for each in topics
-    ):
+    if any(inside(signal.name, each) for each in topics):
         notes.append("no header stamps, time of recording")
     values, target, done = in_unit(
         signal.values, own, signal.unit, unit, f"{log.name}, {signal.name}"
@@ -208,23 +207,20 @@ def in_unit(
     return np.where(np.isfinite(values), values, np.nan), target, notes
 
 
-def _mean_of(log: Log, names: Sequence[str]) -> Signal:
-    """The signal of that name, or the mean of several, which is missing where one is."""
-    found = [signal_of(log, name) for name in names]
+def mean_of(found: Sequence[Signal], place: str) -> Signal:
+    """The mean of signals with the same times and unit, which is missing where one is."""
     first = found[0]
-    if len(found) == 1:
-        return first
     for other in found[1:]:
         require(
             np.array_equal(first.times, other.times) and same_unit(first.unit, other.unit),
-            f"{log.name}, {other.name}",
+            f"{place}, {other.name}",
             expected=f"the times and the unit of {first.name!r}, with which it is averaged",
             got="others",
             remedy="map one of them alone",
         )
     return replace(
         first,
-        name=", ".join(names),
+        name=", ".join(each.name for each in found),
         values=np.mean([each.values for each in found], axis=0),
         unreadable=sum(each.unreadable for each in found),
     )

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from retwin.data.logs.signals import Clock
+from retwin.data.logs.signals import Clock, TimeUnit
 from retwin.data.resampling import Resampling
 from retwin.serialisation.settings import Part, settings_of
 
@@ -26,7 +26,7 @@ class TimeSettings(Part):
 
     column: str = ""
     """Column of the times, or channel of a TDMS group; by default one that is named so."""
-    unit: Literal["", "s", "ms", "us", "ns", "iso"] = ""
+    unit: TimeUnit = ""
     """Its unit, or ISO 8601 text; by default the one that the file states, else by the size of the
     numbers."""
     format: Annotated[str, Field(max_length=100)] = ""

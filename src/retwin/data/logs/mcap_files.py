@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from retwin.checks import needs_extra
-from retwin.data.logs.messages import Series, Stamps, Types
+from retwin.data.logs.messages import Series, Types, Undecoded
 from retwin.data.logs.signals import Clock, Signal, Skipped
 from retwin.errors import InputError
 
@@ -31,43 +32,34 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
     mcap = needs_extra("mcap.reader", "logs", "reads MCAP")
     exceptions = needs_extra("mcap.exceptions", "logs", "reads MCAP")
     needs_extra("rosbags", "logs", "decodes ROS messages")
-    types, series = Types(), Series(wanted)
-    undecoded: set[int] = set()
-    stamped = Stamps(clock, series).time
+    types, series = Types(), Series(wanted, clock)
     with path.open("rb") as stream:
         reader = mcap.NonSeekingReader(stream, validate_crcs=True)
         try:
             for schema, channel, message in reader.iter_messages(log_time_order=False):
-                if channel.id in undecoded or not series.wants(channel.topic):
-                    continue
-                decoded = _decoded(types, schema, channel, message.data)
-                if isinstance(decoded, str):
-                    undecoded.add(channel.id)
-                    series.skip(channel.topic, decoded)
-                    continue
-                time = stamped(channel.topic, message.log_time, decoded)
-                series.add(channel.topic, time, decoded)
+                if series.wants(channel.topic):
+                    decode = partial(_decoded, types, schema, channel, message.data)
+                    series.add(channel.topic, str(channel.id), message.log_time, decode)
         except (exceptions.EndOfFile, struct.error):
             raise _cut_off(path) from None
     yield from series.found()
 
 
 def _decoded(types: Types, schema: Any, channel: Any, data: bytes) -> Any:
-    """A message, or why it cannot be decoded."""
+    """A message; `Undecoded` if it is in another encoding or of an unknown type."""
     encoding = channel.message_encoding
     if encoding == "json":
         found = json.loads(data)
-        return found if isinstance(found, dict | list | int | float) else "text"
+        if not isinstance(found, dict | list | int | float):
+            raise Undecoded("text")
+        return found
     if encoding not in ("cdr", "ros1") or schema is None:
-        return f"messages in the encoding {encoding[:40]!r}, which is not read"
+        raise Undecoded(f"messages in the encoding {encoding[:40]!r}, which is not read")
     name = schema.name
     if schema.encoding in DEFINED and schema.data.strip():
         text = schema.data.decode("utf-8", "replace")
         name = types.define(name, text, idl=DEFINED[schema.encoding])
-    try:
-        return types.decode(data, name, ros1=encoding == "ros1")
-    except KeyError:
-        return f"messages of the type {name[:80]}, which the log does not define"
+    return types.decode(data, name, ros1=encoding == "ros1")
 
 
 def _cut_off(path: Path) -> InputError:

@@ -10,13 +10,13 @@ from __future__ import annotations
 import keyword
 import re
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from retwin.checks import at_most, require
-from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Clock, Signal, Skipped
+from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Clock, Signal, Skipped, inside
 
 MAX_ELEMENTS = 64
 """Elements of an array that become signals; images and point clouds have more."""
@@ -29,6 +29,10 @@ OWN_NAMES = ("name", "child_frame_id", "key")
 TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,3}", re.ASCII)
 STAMP = ("sec", "nanosec", "nsec", "secs", "nsecs")
 """Fields of a stamp, of which no signals are made."""
+
+
+class Undecoded(Exception):
+    """Messages that are not decoded; the message of this says why."""
 
 
 class Types:
@@ -72,15 +76,18 @@ class Types:
         return name
 
     def decode(self, data: bytes, name: str, *, ros1: bool = False) -> Any:
-        """The message of that type; KeyError if the type is not known."""
+        """The message of that type; `Undecoded` if the type is not known."""
         from rosbags.typesys.msg import normalize_msgtype
 
         name = normalize_msgtype(name)
         own = name in self._store.fielddefs
         store = self._store if own else (self._ros1 if ros1 else self._known)
-        if name not in store.fielddefs:
-            raise KeyError(name)
-        return store.deserialize_ros1(data, name) if ros1 else store.deserialize_cdr(data, name)
+        try:
+            return store.deserialize_ros1(data, name) if ros1 else store.deserialize_cdr(data, name)
+        except KeyError:  # of the type, or of one inside it
+            raise Undecoded(
+                f"messages of the type {name[:80]}, which the log does not define"
+            ) from None
 
 
 def _require_name(fine: object, name: str) -> None:
@@ -102,30 +109,48 @@ def _header_stamp(message: Any) -> int | None:
 class Series:
     """Numbers of messages, collected by their names.
 
+    Where header stamps are wanted, a topic whose first message has none has the times of recording,
+    which is noted.
+
     Parameters
     ----------
     wanted : frozenset of str or None
         The names of the signals to keep.
+    clock : Clock
+        Whether times are those of the recording or of the header stamps.
 
     """
 
-    def __init__(self, wanted: frozenset[str] | None) -> None:
+    def __init__(self, wanted: frozenset[str] | None, clock: Clock) -> None:
         self._wanted = wanted
+        self._stamped = clock.stamps == "header"
+        self._has_stamps: dict[str, bool] = {}
+        self._undecoded: set[tuple[str, str]] = set()
         self._times: dict[str, array[int]] = {}
         self._values: dict[str, array[float]] = {}
         self._skipped: dict[str, str] = {}
 
     def wants(self, topic: str) -> bool:
         """Whether a signal of that topic is wanted."""
-        fine = self._wanted is None or any(
-            each == topic or each.startswith((f"{topic}.", f"{topic}[")) for each in self._wanted
-        )
+        fine = self._wanted is None or any(inside(each, topic) for each in self._wanted)
         if not fine:
             self.skip(topic, UNWANTED)
         return fine
 
-    def add(self, topic: str, time: int, message: Any) -> None:
-        """The numbers of a message at a time in ns."""
+    def add(self, topic: str, kind: str, recorded: int, decode: Callable[[], Any]) -> None:
+        """The numbers of a message that was recorded at a time in ns.
+
+        Of a topic and kind of messages of which one is `Undecoded`, no other is tried.
+        """
+        if (topic, kind) in self._undecoded:
+            return
+        try:
+            message = decode()
+        except Undecoded as error:
+            self._undecoded.add((topic, kind))
+            self.skip(topic, str(error))
+            return
+        time = self._time(topic, recorded, message)
         for name, value in self._leaves(topic, message, 0):
             if self._wanted is not None and name not in self._wanted:
                 self.skip(name, UNWANTED)
@@ -138,6 +163,16 @@ class Series:
                 self._values[name] = array("d")
             times.append(time)
             self._values[name].append(value)
+
+    def _time(self, topic: str, recorded: int, message: Any) -> int:
+        """The time of a message in ns."""
+        if not self._stamped or self._has_stamps.get(topic) is False:
+            return recorded
+        stamp = _header_stamp(message) or 0  # a stamp of 0 was never set
+        if not self._has_stamps.setdefault(topic, stamp > 0):
+            self.skip(topic, NO_STAMP)
+            return recorded
+        return stamp
 
     def skip(self, name: str, reason: str) -> None:
         """Note that no signal is made of a topic or field."""
@@ -188,38 +223,6 @@ class Series:
             own = names[place] if names is not None else _own_name(value)
             inner = f"{name}[{place if own is None else own[:MAX_NAME]}]"
             yield from self._leaves(inner, value, depth + 1)
-
-
-class Stamps:
-    """The times of messages: of their recording, or the stamps of their headers.
-
-    A topic whose first message has no stamp has the times of recording, which is noted.
-
-    Parameters
-    ----------
-    clock : Clock
-        Which of them are wanted.
-    series : Series
-        What notes topics without stamps.
-
-    """
-
-    def __init__(self, clock: Clock, series: Series) -> None:
-        self._wanted = clock.stamps == "header"
-        self._series = series
-        self._has: dict[str, bool] = {}
-
-    def time(self, topic: str, recorded: int, message: Any) -> int:
-        """The time of a message of a topic in ns."""
-        if not self._wanted or self._has.get(topic) is False:
-            return recorded
-        stamp = _header_stamp(message) or 0  # a stamp of 0 was never set
-        if topic not in self._has:
-            self._has[topic] = stamp > 0
-            if not stamp:
-                self._series.skip(topic, NO_STAMP)
-                return recorded
-        return stamp
 
 
 def _names_elements(key: str, value: Any) -> bool:

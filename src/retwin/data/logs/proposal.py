@@ -16,7 +16,7 @@ from retwin.data.io.assembly import DataCase
 from retwin.data.logs.channels import in_order
 from retwin.data.logs.cutting import union_of_times
 from retwin.data.logs.mapping import ChannelMapping, Cut, Mapping, TimeSettings
-from retwin.data.logs.proposal_text import Chosen, Draft, Fact, mapping_text, units_of
+from retwin.data.logs.proposal_text import Chosen, Fact, mapping_text, units_of
 from retwin.data.logs.reading import log_format, read_log
 from retwin.data.logs.signals import NANOSECOND, NO_STAMP, Log, Signal
 from retwin.data.logs.units import compatible
@@ -254,16 +254,12 @@ def proposed(
         for name, table in chosen.items()
     }
     unknown = tuple(c for table in chosen.values() for c, fact in table.items() if fact is None)
-    mapping = None
-    if tables["outputs"]:
-        mapping = Mapping(
-            rate=rate,
-            time=time,
-            cut=cut,
-            commands=tables["commands"],
-            outputs=tables["outputs"],
-        )
-    text = mapping_text(log, Draft(time, rate, cut, chosen, tables), facts, case, delay)
+    commands, outputs = tables["commands"], tables["outputs"]
+    draft = Mapping.model_construct(
+        rate=rate, time=time, cut=cut, commands=commands, outputs=outputs
+    )
+    mapping = draft if draft.outputs else None
+    text = mapping_text(log, draft, chosen, facts, case, delay)
     channels = {
         fact.name: channel for table in chosen.values() for channel, fact in table.items() if fact
     }

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from retwin.data.io.assembly import DataCase
-from retwin.data.logs.mapping import ChannelMapping, Cut, TimeSettings
+from retwin.data.logs.mapping import Mapping
 from retwin.data.logs.signals import NO_STAMP, Log
-from retwin.data.logs.tables import TIMES
+from retwin.data.tables import TIMES
 from retwin.serialisation.configs import toml_text
 
 MAX_LISTED = 200
@@ -51,32 +51,6 @@ Chosen = dict[str, dict[str, "Fact | None"]]
 """By table of the mapping, and by channel: its signal, or None where it is to be named."""
 
 
-@dataclass(frozen=True)
-class Draft:
-    """What a mapping will hold.
-
-    Attributes
-    ----------
-    time : TimeSettings
-        The clock.
-    rate : float
-        The sample rate in Hz.
-    cut : Cut
-        What starts a trajectory.
-    chosen : dict
-        The signals of the channels.
-    tables : dict
-        The same as they are written, without the channels that have no signal.
-
-    """
-
-    time: TimeSettings
-    rate: float
-    cut: Cut
-    chosen: Chosen
-    tables: dict[str, dict[str, ChannelMapping]]
-
-
 def _comment(text: str) -> str:
     return "".join(c if c.isprintable() else " " for c in text)
 
@@ -91,7 +65,8 @@ def _seen(fact: Fact) -> str:
 
 def mapping_text(
     log: Log,
-    draft: Draft,
+    draft: Mapping,
+    chosen: Chosen,
     facts: Sequence[Fact],
     case: DataCase | None = None,
     delay: float | None = None,
@@ -102,8 +77,10 @@ def mapping_text(
     ----------
     log : Log
         Its name, and what of it is not read.
-    draft : Draft
-        What is proposed.
+    draft : Mapping
+        What is proposed, without the channels that have no signal.
+    chosen : dict
+        The signals of all channels.
     facts : sequence of Fact
         What is seen of all signals.
     case : DataCase, optional
@@ -112,7 +89,7 @@ def mapping_text(
         The median time in s from the header stamps of messages to their recording, if known.
 
     """
-    chosen, tables, cut, time = draft.chosen, draft.tables, draft.cut, draft.time
+    cut, time = draft.cut, draft.time
     lines = [f"#:schema {SCHEMA}", f"# Proposed for {_comment(log.name)}; check it.", ""]
     lines += [
         f"rate = {draft.rate!r} # Hz",
@@ -135,7 +112,7 @@ def mapping_text(
                 lines += [f'signal = "" # none that changes has such a name: see below{more}']
                 lines += _units_wanted(name, "", case)
                 continue
-            own = tables[table][name]
+            own = getattr(draft, table)[name]
             lines += [f"# {_seen(fact)}", f"signal = {toml_text(fact.name)}"]
             lines += _units_wanted(name, fact.unit, case)
             lines += [

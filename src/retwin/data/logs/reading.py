@@ -2,42 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import os
-import signal
-import subprocess
-import sys
 from collections.abc import Collection, Iterator
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import IO, Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from retwin.catalog import LOGS, resolve
-from retwin.checks import require
-from retwin.data.logs import text_tables
+from retwin.checks import at_most, require
+from retwin.data import tables
 from retwin.data.logs.signals import MAX_SIGNALS, NANOSECOND, Clock, Log, Signal
-from retwin.data.logs.worker import FRAME
-from retwin.errors import InputError, brief
-from retwin.processes import scratch_folder
 from retwin.progress import Progress
-from retwin.serialisation.files import sha256
+from retwin.serialisation.files import refusing, sha256
 from retwin.serialisation.sizes import Budget
+from retwin.workers.process import Frame
+from retwin.workers.reader import FileReader
 
 BAG = "metadata.yaml"
 """The file that every ROS 2 bag has."""
-BYTES_PER_VALUE = 16
-"""Bytes of a time and a value."""
-MAX_TEXT = 2**16
-"""Bytes of a frame's text at most."""
+WHOLE = "a log that is whole"
 DAMAGED = "get or make the file again, or repair it with the tools of its format"
 SAFE = 2**24
 """Bytes of a table of text up to which it is read here: its reader is Python alone, and a process
 takes half a second to start."""
-CODE = "import sys; sys.path[:] = {path!r}; from retwin.data.logs.worker import main; main()"
 
 
 def is_log(path: Path) -> bool:
@@ -108,19 +95,20 @@ def read_log(
         "format": kind,
         "wanted": None if wanted is None else sorted(wanted),
         "clock": asdict(clock or Clock()),
-        "max_bytes": budget.left,
-        "size": size,
     }
     signals: dict[str, Signal] = {}
     skipped: dict[str, str] = {}
-    here = size <= SAFE and resolve(LOGS[kind].reader) is text_tables.read
-    for each in (_read_here if here else _frames)(path, request, budget):
-        if isinstance(each, Signal):
-            signals[each.name] = each
-            if progress is not None and wanted:
-                progress(len(signals) / len(wanted))
-        else:
-            skipped[each[0]] = each[1]
+    for count, (about, arrays) in enumerate(_frames(path, request, size, budget), 1):
+        remedy = "name those that are wanted in the mapping"
+        at_most(path.name, count, MAX_SIGNALS, "signals", remedy=remedy)
+        if not arrays:
+            skipped[str(about[0])] = str(about[1])
+            continue
+        times, values = arrays
+        name, unit, unreadable = str(about[0]), str(about[1]), int(about[2])
+        signals[name] = Signal(name, times, values, unit, unreadable)
+        if progress is not None and wanted:
+            progress(len(signals) / len(wanted))
     require(
         signals or wanted is not None,  # what is missing then is named with what is alike
         path.name,
@@ -134,28 +122,6 @@ def read_log(
         for name, each in signals.items()
     }
     return Log(path.resolve().name, sha256(path), begin, shifted, skipped)
-
-
-def _read_here(
-    path: Path, request: dict[str, Any], budget: Budget
-) -> Iterator[Signal | tuple[str, str]]:
-    """What the reader of a small table of text finds, with the limits of the other way."""
-    wanted = None if request["wanted"] is None else frozenset(request["wanted"])
-    count = 0
-    try:
-        for each in text_tables.read(path, wanted, Clock(**request["clock"])):
-            count += 1
-            if count > MAX_SIGNALS:
-                raise _refused(path, "more signals than can be")
-            if isinstance(each, Signal):
-                budget.take(BYTES_PER_VALUE * len(each.times))
-                yield each
-            else:
-                yield each.name, each.reason
-    except InputError:
-        raise
-    except Exception as error:
-        raise _refused(path, f"{type(error).__name__}: {brief(error)}") from None
 
 
 def _files(path: Path) -> list[Path]:
@@ -172,103 +138,27 @@ def _files(path: Path) -> list[Path]:
     return files
 
 
-def _frames(
-    path: Path, request: dict[str, Any], budget: Budget
-) -> Iterator[Signal | tuple[str, str]]:
-    """What the process that reads the log sends."""
-    paths = [os.path.abspath(each) for each in sys.path if each]
-    # Libraries unpack to temporary files, which they leave where they fail.
-    with scratch_folder() as scratch:
-        own = {"ARROW_DEFAULT_MEMORY_POOL": "system", "OMP_NUM_THREADS": "1"}
-        places = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), scratch)
-        process = subprocess.Popen(
-            [sys.executable, "-I", "-c", CODE.format(path=paths)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, **own, **places},
-        )
-        assert process.stdin is not None
-        assert process.stdout is not None
-        count = 0
-        try:
-            with suppress(BrokenPipeError):  # it ended at once, which the next lines notice
-                process.stdin.write(json.dumps(request).encode())
-                process.stdin.close()
-            while True:
-                about = _text(process.stdout)
-                if about is None:
-                    raise _ended(path, process)
-                if "done" in about:
-                    return
-                if "begun" in about:
-                    continue
-                count += 1
-                if count > MAX_SIGNALS:
-                    raise _refused(path, "more signals than can be")
-                yield _received(path, about, process, budget)
-        finally:
-            process.kill()
-            process.stdout.close()
-            process.wait()
+def _frames(path: Path, request: dict[str, Any], size: int, budget: Budget) -> Iterator[Frame]:
+    """What `send_signals` yields, in a process with limits."""
+    reader = resolve(LOGS[request["format"]].reader)
+    if size <= SAFE and reader is tables.read:
+        with refusing(path.name, expected=WHOLE, remedy=DAMAGED):
+            for about, arrays in send_signals(request):
+                budget.take(sum(each.nbytes for each in arrays))
+                yield about, arrays
+        return
+    task = f"{__name__}:send_signals"
+    with FileReader(task, expected=WHOLE, remedy=DAMAGED) as process:
+        yield from process.read(request, path.name, size, budget)
 
 
-def _received(
-    path: Path, about: dict[str, Any], process: subprocess.Popen[bytes], budget: Budget
-) -> Signal | tuple[str, str]:
-    """The signal, or the error, of one frame."""
-    assert process.stdout is not None
-    if "error" in about:
-        argument, expected, got, remedy = map(str, about["error"])
-        raise InputError(argument, expected=expected, got=got, remedy=remedy)
-    if "memory" in about:
-        budget.take(budget.left + 1)
-    if "damaged" in about:
-        raise _refused(path, str(about["damaged"]))
-    if "skipped" in about:
-        return str(about["skipped"]), str(about["reason"])
-    count = int(about["count"])
-    budget.take(BYTES_PER_VALUE * count)
-    times = _array(process.stdout, count, "<i8")
-    values = _array(process.stdout, count, "<f8")
-    if times is None or values is None:
-        raise _ended(path, process)
-    unit, bad = str(about["unit"]), int(about["unreadable"])
-    return Signal(str(about["name"]), times, values, unit, bad)
-
-
-def _text(stream: IO[bytes]) -> dict[str, Any] | None:
-    """The JSON of a frame, None at the end of the stream."""
-    head = stream.read(FRAME.size)
-    if len(head) < FRAME.size or (size := FRAME.unpack(head)[0]) > MAX_TEXT:
-        return None
-    try:
-        found = json.loads(stream.read(size))
-    except ValueError:
-        return None
-    return found if isinstance(found, dict) else None
-
-
-def _array(stream: IO[bytes], count: int, dtype: str) -> NDArray | None:
-    made = np.empty(count, dtype)
-    view = memoryview(made.view(np.uint8).data)
-    done = 0
-    while done < len(view):
-        part = stream.readinto(view[done:])  # type: ignore[attr-defined]
-        if not part:
-            return None
-        done += part
-    return made
-
-
-def _ended(path: Path, process: subprocess.Popen[bytes]) -> InputError:
-    """The error about a process that ended before its last frame."""
-    code = process.wait()
-    if code == -getattr(signal, "SIGXCPU", 0):
-        return _refused(path, "contents that take longer to read than a log of that size can")
-    why = f"signal {-code}" if code < 0 else f"exit code {code}"
-    return _refused(path, f"contents at which the format's library failed ({why})")
-
-
-def _refused(path: Path, got: str) -> InputError:
-    return InputError(path.name, expected="a log that is whole", got=got, remedy=DAMAGED)
+def send_signals(request: dict[str, Any]) -> Iterator[Frame]:
+    """The task of the process that reads a log: signals with their arrays, or what it skipped."""
+    read = resolve(LOGS[request["format"]].reader)
+    wanted = None if request["wanted"] is None else frozenset(request["wanted"])
+    for each in read(Path(request["path"]), wanted, Clock(**request["clock"])):
+        if isinstance(each, Signal):
+            arrays = [each.times.astype("<i8", copy=False), each.values.astype("<f8", copy=False)]
+            yield (each.name, each.unit, each.unreadable), arrays
+        else:
+            yield (each.name, each.reason), []

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,8 +26,10 @@ UNWANTED = "not named in the mapping"
 """What is noted of signals that are there but not read."""
 NO_STAMP = "without header stamps: the time of recording"
 """What is noted of topics whose messages have no stamps, where those are wanted."""
-UNIT_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Units of times that are numbers, in s."""
+TimeUnit = Literal["", "s", "ms", "us", "ns", "iso"]
+"""Units of times: numbers, or ISO 8601 text; "" for what is found."""
+NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+"""Units of times that are numbers, in ns."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class Clock:
     """
 
     column: str = ""
-    unit: Literal["", "s", "ms", "us", "ns", "iso"] = ""
+    unit: TimeUnit = ""
     format: str = ""
     rate: float | None = None
     stamps: Literal["log", "header"] = "log"
@@ -141,6 +144,21 @@ def named_unit(name: str) -> tuple[str, str]:
     return found[1], unit
 
 
+def inside(name: str, outer: str) -> bool:
+    """Whether a signal is a topic or a column, or a field or an element of it."""
+    return name == outer or name.startswith((f"{outer}.", f"{outer}["))
+
+
+def named_units(titles: Sequence[str]) -> list[tuple[str, str]]:
+    """Name and unit of each title; titles that are alike but for the unit are names as a whole."""
+    pairs = [named_unit(each) for each in titles]
+    several = Counter(name for name, _ in pairs)
+    return [
+        (title.strip() if several[name] > 1 else name, unit)
+        for title, (name, unit) in zip(titles, pairs, strict=True)
+    ]
+
+
 def nanoseconds(time: datetime) -> int:
     """A time in ns since 1970; UTC if it has no time zone."""
     since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - EPOCH
@@ -153,7 +171,7 @@ def even_times(count: int, rate: float, where: str) -> NDArray:
 
 
 def to_nanoseconds(times: NDArray, unit: str, where: str) -> NDArray:
-    """Times (n,) in a unit of `UNIT_SECONDS` as whole ns.
+    """Times (n,) in a unit of `NANOSECONDS` as whole ns; those that are `Decimal` exactly.
 
     Raises
     ------
@@ -164,7 +182,7 @@ def to_nanoseconds(times: NDArray, unit: str, where: str) -> NDArray:
     times = np.asarray(times)
     if times.dtype.kind in "iu" and unit == "ns":
         return times.astype(np.int64)
-    scaled = np.round(times.astype(np.longdouble) * (UNIT_SECONDS[unit] / NANOSECOND))
+    scaled = np.round(times.astype(np.longdouble) * NANOSECONDS[unit])
     fine = np.abs(scaled) < LATEST  # NaN is not
     if not fine.all():
         row = int(np.argmin(fine))
@@ -174,4 +192,6 @@ def to_nanoseconds(times: NDArray, unit: str, where: str) -> NDArray:
             got=f"{times[row]} {unit} in row {row}",
             remedy="remove that row, or check column and unit of [time] in the mapping",
         )
+    if times.dtype.kind == "O":
+        return np.array([round(each * NANOSECONDS[unit]) for each in times], np.int64)
     return scaled.astype(np.int64)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import needs_extra
 from retwin.data.logs.signals import UNWANTED, Clock, Signal, Skipped, even_times, to_nanoseconds
-from retwin.data.logs.tables import row_times, time_column, unit_in
+from retwin.data.row_times import row_times, time_column, unit_in
 from retwin.errors import InputError
 
 UNITS = ("unit_string", "NI_UnitDescription", "unit")

@@ -68,7 +68,7 @@ def converted(values: NDArray, source: str, target: str, where: str) -> NDArray:
         first, second = _unit(source), _unit(target)
         if _angular(first) != _angular(second):
             raise ValueError("one is an angle, the other one is not: is a turn 1 or 2π?")
-        ends = _registry().Quantity(np.array([0.0, 1.0]), first).to(second).magnitude
+        ends = _registry().Quantity(np.array([0.0, 1.0, 2.0]), first).to(second).magnitude
     except InputError:
         raise
     except Exception as error:
@@ -79,21 +79,14 @@ def converted(values: NDArray, source: str, target: str, where: str) -> NDArray:
             remedy=remedy,
         ) from None
     offset, slope = float(ends[0]), float(ends[1] - ends[0])
+    # Every unit of pint that is no logarithm is a line; the others are refused.
+    line = np.isclose(ends[2], offset + 2 * slope, rtol=1e-9, atol=1e-300)
     require(
-        np.isfinite([offset, slope]).all() and slope,
+        np.isfinite(ends).all() and slope and line,
         where,
-        expected=f"a unit that is converted to {target!r}",
+        expected=f"a unit that is converted to {target!r}, and no logarithm",
         got=repr(source),
         remedy=remedy,
-    )
-    # Every unit of pint that is no logarithm is a line; the others are refused.
-    third = float(_registry().Quantity(2.0, first).to(second).magnitude)
-    require(
-        np.isclose(third, offset + 2 * slope, rtol=1e-9, atol=1e-300),
-        where,
-        expected="a unit that is no logarithm",
-        got=repr(source),
-        remedy="convert it before, or map another signal",
     )
     return offset + slope * values
 

@@ -30,12 +30,12 @@ from retwin.data.io.header import CHUNKED_NAMES, FAILED, chunked_header, restore
 from retwin.data.io.zarr_folder import create_chunked, read_header, seal_chunked, write_chunk
 from retwin.deploy.simulations.plan import Recorded, SimulatedChunk, SimulationPlan, simulate_chunk
 from retwin.errors import InputError
-from retwin.jobs import alone, each
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically, write_json
 from retwin.serialisation.identity import identity
 from retwin.serialisation.places import in_use, real_path, room_for
 from retwin.serialisation.sizes import Budget
+from retwin.workers.jobs import alone, each
 
 SCHEMA = 2
 """The version of the plan's identity. Digests of the first, which has no such key, differ."""

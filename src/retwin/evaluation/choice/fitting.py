@@ -24,7 +24,6 @@ from retwin.evaluation.choice.settings import MEMBERS, Choice
 from retwin.evaluation.choice.trials import FAILURES, Trials, shorter, unstable
 from retwin.progress import Progress
 from retwin.scores.distributions import crps_normal
-from retwin.threads import one_thread
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Twin, check_channels
 from retwin.update.blackbox import BLACK_BOXES, fit_black_box
@@ -35,6 +34,7 @@ from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.forecast_errors import ForecastErrors
 from retwin.update.forecasts import LEADS, calibrate_forecasts, forecasts, free_moments
 from retwin.update.residual.fitting import calibrating
+from retwin.workers.threads import one_thread
 
 UNSTABLE = (
     "Free simulation from the commands alone diverges, or is no better than the mean of the "

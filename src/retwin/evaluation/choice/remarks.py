@@ -95,11 +95,11 @@ def _of_twin(records: Trajectories, comparison: Comparison, name: str) -> list[s
         delay, share = _dead_time(y, x)
         if share >= EXPLAINED and abs(delay) >= 0.5:
             seconds = delay / records.rate
-            what = f"A dead time of {seconds:.3g} s" if delay > 0 else "A delay that is shorter"
-            more = "" if delay > 0 else f" by {-seconds:.3g} s"
+            what = f"A dead time of {seconds:.3g} s"
+            if delay < 0:
+                what = f"The twin responds too late: an output that comes {-seconds:.3g} s earlier"
             made.append(
-                f"{what}{more} explains {share:.0%} of the mean square error of the twin in "
-                f"{output}."
+                f"{what} explains {share:.0%} of the mean square error of the twin in {output}."
             )
     return made
 
@@ -139,5 +139,6 @@ def without_twin(scores: Sequence[CandidateScore], chosen: CandidateScore) -> li
         return []
     return [
         f"The {best.title} predicts the same parts better by {gain:.0%}: the twin lacks something "
-        "that the commands determine."
+        "that the commands determine. Add that to the twin; where its parameters need no meaning, "
+        f"take the other model: `retwin.update.fit_black_box(records, {best.name!r})`."
     ]

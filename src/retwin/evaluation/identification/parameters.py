@@ -156,8 +156,7 @@ def _of_fit(before: ParametricTwin, found: Updated) -> Uncertainty:
     basis: Basis = "trajectories"
     if np.isnan(errors).any():
         basis, errors = "samples", np.asarray(local.errors, dtype=float)
-        freedom = max(local.independent - len(errors), 1.0)
-        half = stats.t.ppf(0.975, freedom) * errors
+        half = stats.t.ppf(0.975, local.freedom) * errors
         intervals = np.stack([values - half, values + half], axis=1)
     singular = np.asarray(local.singular_values, dtype=float)
     with np.errstate(divide="ignore"):

@@ -13,9 +13,8 @@ from retwin.errors import InputError
 from retwin.monitor.gate import Gate
 from retwin.monitor.samples import Samples
 from retwin.monitor.settings import FolderSource
-from retwin.monitor.sources.mapped_tables import MappedLayout
 from retwin.monitor.sources.source import Source
-from retwin.monitor.sources.tables import Layout, Table
+from retwin.monitor.sources.tables import GrowingTable, Layout
 from retwin.monitor.updates import EARLIEST
 
 OVERLAP = 60 * 10**9
@@ -83,7 +82,7 @@ class Folder(Files):
     ----------
     settings : FolderSource
         Its pattern is absolute.
-    layouts : mapping of str to Layout or MappedLayout
+    layouts : mapping of str to Layout
         The columns of each machine's files.
     newest : mapping of str to int
         Time of the newest stored sample of each machine that has any, in ns.
@@ -95,15 +94,15 @@ class Folder(Files):
     def __init__(
         self,
         settings: FolderSource,
-        layouts: Mapping[str, Layout | MappedLayout],
+        layouts: Mapping[str, Layout],
         newest: Mapping[str, int],
         report: Callable[[str], None],
     ) -> None:
         super().__init__("folder", settings, layouts, newest, report)
         self._layouts = layouts
-        self._tables: dict[tuple[str, str], Table] = {}
+        self._tables: dict[tuple[str, str], GrowingTable] = {}
 
-    def _changed(self, asset: str, paths: list[str]) -> list[Table]:
+    def _changed(self, asset: str, paths: list[str]) -> list[GrowingTable]:
         """The files of a machine that were written to, in the order of their new rows."""
         for key in [key for key in self._tables if key[0] == asset and key[1] not in paths]:
             del self._tables[key]

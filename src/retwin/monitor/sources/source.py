@@ -7,7 +7,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any
 
 from retwin.errors import InputError
 from retwin.monitor.gate import Gate
@@ -108,9 +107,8 @@ class Source(ABC):
         failed = False
         while not (failed and stop.is_set()):
             try:
-                _result(first or gate.send(samples), stop)
-            except _Stopped:
-                return False
+                if not _finished(first or gate.send(samples), stop):
+                    return False
             except Exception as error:  # whatever it was, the source has to go on
                 if not failed:
                     reason = error if isinstance(error, InputError) else repr(error)
@@ -124,15 +122,13 @@ class Source(ABC):
         return False
 
 
-class _Stopped(Exception):
-    """The end of the program, while something was waited for."""
-
-
-def _result(future: Future, stop: threading.Event) -> Any:
-    """What a future holds; _Stopped if it has nothing some time after `stop` was set."""
+def _finished(future: Future, stop: threading.Event) -> bool:
+    """Whether a future has a result; False if it has none some time after `stop` was set."""
     while True:
         try:
-            return future.result(timeout=0.5)
+            future.result(timeout=0.5)
         except TimeoutError:
             if stop.is_set():
-                raise _Stopped from None
+                return False
+        else:
+            return True

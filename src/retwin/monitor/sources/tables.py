@@ -2,66 +2,144 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import datetime
-from decimal import Decimal
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.cases.case import Case
-from retwin.cases.columns import ColumnRecords, number
-from retwin.checks import needs_extra, require, same_names
-from retwin.data.logs.signals import nanoseconds
+from retwin.checks import require
+from retwin.data.layout import HEAD, encoding_of, text_layout
+from retwin.data.layout import Layout as TextLayout
+from retwin.data.logs.arrow_tables import read_table
+from retwin.data.logs.channels import in_unit, mean_of
+from retwin.data.logs.mapping import ChannelMapping
+from retwin.data.logs.signals import NANOSECOND, Clock, Signal, TimeUnit, named_unit
+from retwin.data.logs.units import same_unit
+from retwin.data.row_times import time_column, times_that_are
+from retwin.data.tables import Table, text_table
 from retwin.errors import InputError, brief
-from retwin.monitor.settings import FolderSource
 
 CHUNK = 2**16
 """Bytes of a CSV file, and of one of its rows, that are read at once."""
 ROWS = 8192
-"""Rows of a Parquet file that are read at once."""
+"""Rows of a Parquet file that are converted at once."""
 TAIL = 256
 """Bytes before the place up to which a file was read that are compared before it is read on."""
-NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+NEVER = -(2**63)
+"""Time in ns of a command that was not measured yet."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a table has the times, and each channel: the mean of its columns."""
+    """Where a table has the times, and each channel: the mean of its columns.
+
+    Parameters
+    ----------
+    time, unit : str
+        The column of the times, and its unit, or "iso"; "" for what is found.
+    columns : tuple of tuple of str
+        The columns of each channel, by their titles, with or without units.
+    format : str
+        The format of times that are other text.
+    channels : tuple
+        Of a mapping: name, mapping and unit of each channel, commands first; the unit is None where
+        the twin states none. Without it, values are taken as they are, and a row with a cell that
+        is no number is none.
+    commands : int
+        The number of commands, of a mapping.
+
+    """
 
     time: str
-    unit: str
+    unit: TimeUnit
     columns: tuple[tuple[str, ...], ...]
+    format: str = ""
+    channels: tuple[tuple[str, ChannelMapping, str | None], ...] = ()
+    commands: int = 0
+
+    @property
+    def signals(self) -> list[str]:
+        """The columns of all channels, each once."""
+        return list(dict.fromkeys(each for own in self.columns for each in own))
 
     @property
     def wanted(self) -> list[str]:
-        """All columns, that of the times first."""
-        return [self.time, *dict.fromkeys(each for own in self.columns for each in own)]
+        """All columns, that of the times first if it is named."""
+        return [self.time] * bool(self.time) + self.signals
 
-    def nanoseconds(self, cell: str) -> int:
-        """The time in a cell, from 1970 on; ValueError if it is none."""
-        if self.unit == "iso":
-            return nanoseconds(datetime.fromisoformat(cell.strip()))
-        found = Decimal(cell.strip()) * NANOSECONDS[self.unit]
-        if not abs(found) < 2**63:
-            raise ValueError("a time that is out of range")
-        return round(found)
+    @property
+    def clock(self) -> Clock:
+        """Where the times are."""
+        return Clock(self.time, self.unit, self.format)
 
-    def values(self, cells: Mapping[str, NDArray]) -> NDArray:
-        """The channels (n, d) of columns (n,)."""
-        found = [np.mean([cells[each] for each in own], axis=0) for own in self.columns]
-        made = np.array(found, dtype=float).reshape(len(self.columns), -1).T
-        return np.where(np.isfinite(made), made, np.nan)
+    @property
+    def offset(self) -> int:
+        """What is added to the times in ns; all channels of a row have the same."""
+        return round(self.channels[0][1].clock_offset / NANOSECOND) if self.channels else 0
 
-    def table(self, path: Path) -> Table:
+    def rows(self, table: Table, since: NDArray, end: Any) -> Rows:
+        """The samples in a table; `since` (commands,) is when each command was last known, in ns.
+
+        It is changed by those of the table.
+        """
+        cells, unit, where = table.stamps(table.time_name(self.clock))
+        times, kept, bad = times_that_are(cells, unit, self.clock, where)
+        found: dict[str, Signal] = {}
+        every = np.arange(table.rows)
+        good = np.isin(every, kept)
+        for name in self.signals:
+            numbers, odd = table.numbers(name)
+            odd &= good
+            found[name] = Signal(name, every, numbers, table.units[name] if self.channels else "")
+            if self.channels and odd.any():
+                bad.append(f"{odd.sum()} values of {name} in {table.place} that are no numbers")
+            elif odd.any():
+                text = table.cells(name)[odd].tolist()
+                bad += [f"{str(each)[:80]!r} in {table.place}, column {name!r}" for each in text]
+                good &= ~odd
+        means = [mean_of([found[each] for each in own], table.place) for own in self.columns]
+        columns = [each.values for each in means]
+        for at, (channel, mean) in enumerate(zip(self.channels, means, strict=False)):
+            columns[at] = _in_unit_of(channel, mean, table.place)
+        values = np.stack(columns, axis=1)[good]
+        times = times[good[kept]] + self.offset
+        self._mask(times, values, since)
+        return Rows(times, np.where(np.isfinite(values), values, np.nan), bad, end)
+
+    def _mask(self, times: NDArray, values: NDArray, since: NDArray) -> None:
+        """Leave outputs out where a command is missing for longer than its `max_gap`."""
+        limits = [own.max_gap for _, own, _ in self.channels[: self.commands]]
+        for time, row in zip(times if self.commands else (), values, strict=False):
+            since[np.isfinite(row[: self.commands])] = time
+            for limit, last in zip(limits, since, strict=True):
+                if limit is not None and last != NEVER and time - last > limit / NANOSECOND:
+                    row[self.commands :] = np.nan
+
+    def table(self, path: Path) -> GrowingTable:
         """What reads that file, by its suffix."""
         return (Parquet if path.suffix == ".parquet" else Csv)(path, self)
+
+
+def _in_unit_of(
+    channel: tuple[str, ChannelMapping, str | None], signal: Signal, place: str
+) -> NDArray:
+    """The mean (n,) of columns as values of a channel of a mapping."""
+    name, own, unit = channel
+    where = f"{place}, {own.signals[0]}"
+    made, target, _ = in_unit(signal.values, own, signal.unit, unit, where)
+    require(
+        unit is not None or own.unit or same_unit(target, "1"),
+        where,
+        expected=f"the unit of {name}, of which the twin states none",
+        got=f"that of the table alone, {target}",
+        remedy=f"write unit = … for {name} in the mapping, the unit of its calibration data",
+    )
+    return made
 
 
 @dataclass(frozen=True)
@@ -77,52 +155,19 @@ class Rows:
     end: Any
 
 
-def layout_of(settings: FolderSource, channels: Sequence[str], case: Case | None) -> Layout:
-    """The columns of the settings, else those of the case's records, else names of the channels.
-
-    Raises
-    ------
-    InputError
-        A channel has no column, or there is another; or the records of the case differ.
-
-    """
-    records = case.records if case is not None else None
-    known = records.every_record if isinstance(records, ColumnRecords) else ()
-    columns = settings.columns or _same(
-        [dict(each.columns) for each in known], "columns", {name: name for name in channels}
-    )
-    remedy = 'write for each channel NAME = "COLUMN"'
-    same_names("sources.columns", columns, channels, "a column for each of", remedy=remedy)
-    clocks = [each.clock for each in known if each.clock is not None]
-    time = settings.time or _same([each.column for each in clocks], "time", "time")
-    unit = settings.unit or _same([each.unit for each in clocks], "unit", "s")
-    several = [columns[name] for name in channels]
-    return Layout(time, unit, tuple((e,) if isinstance(e, str) else tuple(e) for e in several))
-
-
-class Columns(Protocol):
-    """What a table must have."""
-
-    @property
-    def wanted(self) -> list[str]:
-        """The columns that are read."""
-
-
-class Table(ABC):
+class GrowingTable(ABC):
     """A file of rows that may grow, or be replaced by another one of that name.
 
     Parameters
     ----------
     path : Path
         The file.
-    layout : Columns
+    layout : Layout
         Its columns.
 
     """
 
-    layout: Columns
-
-    def __init__(self, path: Path, layout: Columns) -> None:
+    def __init__(self, path: Path, layout: Layout) -> None:
         self.path = path
         self.layout = layout
         self.place: Any = None
@@ -165,18 +210,12 @@ class _Place:
 
     offset: int = 0
     tail: bytes = b""
-    known: Any = None
+    layout: TextLayout | None = None
+    since: NDArray | None = None
 
 
-class TextTable(Table):
-    """Rows of text. An incomplete last one waits for its end."""
-
-    @abstractmethod
-    def _parsed(self, text: bytes, known: Any) -> Rows | None:
-        """Complete lines, and what is known of the table after them as the end.
-
-        `known` is None at the begin of the file. None is returned if the lines hold no row yet.
-        """
+class Csv(GrowingTable):
+    """A text table, whose incomplete last row waits for its end, and a header for its first row."""
 
     def _rows(self) -> Iterator[Rows]:
         with self.path.open("rb") as file:
@@ -187,11 +226,11 @@ class TextTable(Table):
                 text = chunk[: chunk.rfind(b"\n") + 1]
                 if len(chunk) == CHUNK and not text:
                     raise ValueError(f"a row of more than {CHUNK} bytes")
-                made = self._parsed(text, place.known) if text else None
+                made = self._parsed(text, place) if text else None
                 if made is None:
                     return
-                place = _Place(place.offset + len(text), (place.tail + text)[-TAIL:], made.end)
-                yield replace(made, end=place)
+                place = made.end
+                yield made
 
     def _kept(self, file: Any) -> _Place:
         """How far the file was read, if it still is the same up to there."""
@@ -199,88 +238,63 @@ class TextTable(Table):
         file.seek(place.offset - len(place.tail))
         return place if file.read(len(place.tail)) == place.tail else _Place()
 
-
-class Csv(TextTable):
-    """A CSV file with a header."""
-
-    layout: Layout
-
-    def _parsed(self, text: bytes, known: tuple[str, ...] | None) -> Rows:
-        lines = text.decode("utf-8", "replace").split("\n")
-        header = known or ()
-        if known is None:
-            header = tuple(next(csv.reader([lines[0].removeprefix("\ufeff")])))
-            missing = [each for each in self.layout.wanted if each not in header]
-            if missing:
-                raise ValueError(f"no column {', '.join(missing)} in its header")
-            lines = lines[1:]
-        at = {name: header.index(name) for name in self.layout.wanted}
-        times: list[int] = []
-        cells: list[list[float]] = []
-        bad: list[str] = []
-        clock = at.pop(self.layout.time)
-        for line in lines:
-            if not line.strip():
-                continue
+    def _parsed(self, text: bytes, place: _Place) -> Rows | None:
+        """Complete lines after a place; None if they hold no row yet."""
+        layout, name = place.layout, self.path.name
+        encoding = layout.encoding if layout else encoding_of(text)
+        if encoding == "utf-16":  # the end of a row is not found by its bytes
+            raise ValueError("text in UTF-16, whose rows are not found while it grows: write UTF-8")
+        lines = text.decode(encoding, "replace").split("\n")[:-1]
+        if layout is None:
+            layout = text_layout(lines[:HEAD], encoding, name, self.layout.wanted)
+            lines = lines[layout.first :]
+            if not lines:
+                return None
+        rows, bad = [], []
+        for line in filter(str.strip, lines):
             try:
-                (row,) = csv.reader([line], strict=True)
-                if len(row) != len(header):
-                    raise ValueError(f"{len(row)} of {len(header)} cells")
-                found = [number(row[column]) for column in at.values()]
-                times.append(self.layout.nanoseconds(row[clock]))
-                cells.append(found)
-            except (ValueError, ArithmeticError, csv.Error) as error:
-                bad.append(f"{line[:80]!r} in {self.path.name} ({brief(error)})")
-        table = np.array(cells, dtype=float).reshape(len(cells), len(at))
-        values = self.layout.values(dict(zip(at, table.T, strict=True)))
-        return Rows(np.array(times, dtype=np.int64), values, bad, header)
+                row = layout.row(line.rstrip("\r"), name)
+            except ValueError as error:
+                bad.append(f"{line[:80]!r} in {name} ({brief(error)})")
+                continue
+            if any(cell.strip() for cell in row):
+                rows.append(row)
+        wanted = {*self.layout.signals, self.layout.time or time_column(layout.names)} - {""}
+        columns = {
+            each: np.array([row[at] for row in rows], np.str_)
+            for each in wanted
+            for at in [layout.column(each)]
+        }
+        since = np.full(self.layout.commands, NEVER) if place.since is None else place.since.copy()
+        end = _Place(place.offset + len(text), (place.tail + text)[-TAIL:], layout, since)
+        made = self.layout.rows(text_table(name, layout, len(rows), columns), since, end)
+        return replace(made, bad=bad + made.bad)
 
 
-class Parquet(Table):
+class Parquet(GrowingTable):
     """A Parquet file, which is written anew when it grows."""
 
-    layout: Layout
-
     def _rows(self) -> Iterator[Rows]:
-        parquet = needs_extra("pyarrow.parquet", "parquet", "reads Parquet files")
-        with parquet.ParquetFile(self.path) as file:
-            clock = file.read(columns=[self.layout.time]).column(0)
-            done, last = self.place or (0, None)
-            if done > len(clock) or (done and clock[done - 1].as_py() != last):
-                done = 0  # another file
-            first = 0
-            for batch in file.iter_batches(ROWS, columns=self.layout.wanted):
-                first, begin = first + batch.num_rows, first
-                if first > done:
-                    part = batch.slice(max(0, done - begin))
-                    yield self._converted(part, (first, clock[first - 1].as_py()))
-
-    def _converted(self, batch: Any, end: Any) -> Rows:
-        cells = {
-            name: batch.column(name).cast("double").to_numpy(zero_copy_only=False).astype(float)
-            for name in self.layout.wanted[1:]
-        }
-        clock = batch.column(self.layout.time)
-        stamped = str(clock.type).startswith("timestamp")
-        if stamped:
-            clock = clock.cast("timestamp[ns]", safe=False).cast("int64")
-        times, kept, bad = [], [], []
-        for i, cell in enumerate(clock.to_pylist()):
-            try:
-                times.append(int(cell) if stamped else self.layout.nanoseconds(str(cell)))
-                kept.append(i)
-            except (ValueError, TypeError, ArithmeticError) as error:
-                bad.append(f"time {str(cell)[:80]!r} in {self.path.name} ({brief(error)})")
-        return Rows(np.array(times, dtype=np.int64), self.layout.values(cells)[kept], bad, end)
-
-
-def _same(found: list[Any], what: str, default: Any) -> Any:
-    """What all records of a case have in common, or the default where there are none."""
-    require(
-        all(each == found[0] for each in found),
-        f"sources.{what}",
-        expected=f"the {what} of the files",
-        got="none, and records of the case that differ in it",
-        remedy=f"give `{what}` in the source",
-    )
-    return found[0] if found else default
+        own = self.layout
+        names = {each: named_unit(each)[0] for each in own.wanted}
+        table = read_table(self.path, frozenset([*names, *names.values()]), own.clock)
+        found = {each: each if each in table.units else plain for each, plain in names.items()}
+        lacking = [each for each, name in found.items() if name not in table.units]
+        if lacking:
+            raise ValueError(f"no column {', '.join(lacking)}")
+        clock = own.time or table.time_name(own.clock)
+        found.setdefault(clock, clock)
+        columns = {each: table.cells(name) for each, name in found.items()}
+        units = {each: table.units[name] for each, name in found.items()}
+        done, last, since = self.place or (0, None, None)
+        if done > table.rows or (done and columns[clock][done - 1] != last):
+            done, since = 0, None  # another file
+        since = np.full(own.commands, NEVER) if since is None else since
+        for begin in range(done, table.rows, ROWS):
+            part = slice(begin, min(begin + ROWS, table.rows))
+            some = {each: cells[part] for each, cells in columns.items()}
+            since = since.copy()
+            end = (part.stop, columns[clock][part.stop - 1], since)
+            yield own.rows(
+                Table(self.path.name, units, part.stop - begin, some.__getitem__), since, end
+            )

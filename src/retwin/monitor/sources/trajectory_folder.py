@@ -16,10 +16,10 @@ from retwin.checks import require
 from retwin.data.io import load
 from retwin.errors import InputError
 from retwin.monitor.gate import Gate
-from retwin.monitor.samples import LONGEST, SECOND, Trajectory
+from retwin.monitor.samples import LONGEST, SECOND, Trajectory, places
 from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.folder import Files
-from retwin.monitor.sources.tables import layout_of
+from retwin.monitor.sources.layouts import layout_of
 from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.updates import EARLIEST
 from retwin.twins.twin import check_channels
@@ -134,7 +134,7 @@ class TrajectoryFolder(Files):
         if not len(moments):
             return []
         begin = int(moments.min())
-        place = np.round((moments - begin) * (twin.rate / SECOND)).astype(np.int64)
+        place, first = places(moments, begin, twin.rate)  # the first row counts, as of samples
         require(
             place.max() < LONGEST,
             path.name,
@@ -143,6 +143,5 @@ class TrajectoryFolder(Files):
             remedy="write each trajectory to a file of its own, and check the unit of its times",
         )
         values = np.full((int(place.max()) + 1, len(channels)), np.nan)
-        # The first row of a place counts, as it does for samples.
-        values[place[::-1]] = np.concatenate(rows)[::-1]
+        values[place] = np.concatenate(rows)[first]
         return [Trajectory(asset, begin, values)]

@@ -291,8 +291,9 @@ def _limits(found: Identification) -> Iterator[str]:
     if found.basis == "samples":
         yield (
             "Standard errors take the residuals for noise that is correlated from one sample to "
-            "the next (a first-order autoregression), since there are fewer than three "
-            "trajectories, or one of them alone determines a parameter."
+            "the next (a first-order autoregression), or within eight blocks of time, whichever is "
+            "wider, since there are fewer than three trajectories, or one of them alone determines "
+            "a parameter."
         )
     result = found.found
     if isinstance(result, Posterior):

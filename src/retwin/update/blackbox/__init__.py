@@ -12,13 +12,13 @@ import numpy as np
 from retwin.checks import one_of
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.threads import one_thread
 from retwin.twins.twin import checked_seed
 from retwin.update.blackbox.arx import fit_arx
 from retwin.update.blackbox.estimate import BlackBox
 from retwin.update.blackbox.lstm import fit_lstm
 from retwin.update.blackbox.narx import fit_narx
 from retwin.update.blackbox.neural import fit_neural_ss
+from retwin.workers.threads import one_thread
 
 __all__ = ["BLACK_BOXES", "BlackBox", "fit_black_box"]
 

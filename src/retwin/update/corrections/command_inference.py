@@ -20,7 +20,6 @@ from retwin.inference.em import expectation_maximisation
 from retwin.inference.hierarchy import Hierarchy, Likelihood
 from retwin.inference.noise import Noise
 from retwin.inference.solver import Solution, blocks
-from retwin.threads import one_thread
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import at_bound, first_delays
@@ -35,6 +34,7 @@ from retwin.update.corrections.missed_segments import (
 )
 from retwin.update.corrections.offset_features import FIRST_OFFSET, OffsetFeatures
 from retwin.update.corrections.sample_noise import SampleNoise
+from retwin.workers.threads import one_thread
 
 MAX_ROUNDS = 12
 """Rounds of expectation-maximisation at most, with a search for missed segments in each."""

@@ -16,7 +16,6 @@ from retwin.checks import require
 from retwin.data.measured import doubtful, unmeasured
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.threads import one_thread
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
@@ -32,6 +31,7 @@ from retwin.update.dynamics.noise import fit_noise, folds, widening
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
+from retwin.workers.threads import one_thread
 
 __all__ = ["FittedDynamics", "assembled", "fit_dynamics"]
 

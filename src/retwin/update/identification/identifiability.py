@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
+from scipy.stats import t as student
 
 RANK_TOLERANCE = 1e-5
 """Singular values below this share of the largest count as 0: finite differences are no better."""
@@ -25,6 +27,14 @@ MIN_TRAJECTORIES = 3
 LEVERAGE = 1 - 1e-6
 """Share of the information on a direction that a trajectory may have: without it, nothing would be
 known of that direction, nor of its error."""
+BLOCKS = 8
+"""Blocks of time over which residuals are summed, of all trajectories together."""
+SHARED = 0.5
+"""Share of the information on a direction that one block may have: beyond it, as with the start of
+a state, sums over blocks say nothing of the error."""
+COPY, COMPARED = 0.999, 10
+"""Correlation of the residuals of two trajectories from which one is a copy of the other, and the
+samples of a trajectory below which that is not compared."""
 MAX_AUTOCORRELATION = 0.999
 """Largest lag-one autocorrelation, which bounds the correlation time at 1999 samples."""
 
@@ -38,9 +48,9 @@ class Identifiability:
     names : tuple of str
         Names of the parameters.
     errors : NDArray
-        (k,), standard errors in the parameters' units, if the residuals of a trajectory correlate
-        from one sample to the next only; infinite where outputs do not depend on the parameter. Of
-        a parameter that is identified, what undetermined directions add is limited by the ranges.
+        (k,), standard errors in the parameters' units, by `score_covariance`; infinite where
+        outputs do not depend on the parameter. Of a parameter that is identified, what undetermined
+        directions add is limited by the ranges.
     correlation : NDArray
         (k, k), of the estimates; NaN where an error is infinite.
     singular_values : NDArray
@@ -58,6 +68,11 @@ class Identifiability:
         starts that fit equally well agree, and the estimate depends on no bound.
     independent : float
         Effective sample size of the residuals, which are autocorrelated.
+    freedom : NDArray
+        (k,), degrees of freedom of Student's t distribution that estimates follow, divided by
+        `errors`.
+    white : NDArray
+        (k,), what `errors` would be of residuals without any correlation.
 
     """
 
@@ -70,6 +85,8 @@ class Identifiability:
     depends: NDArray
     identified: NDArray
     independent: float
+    freedom: NDArray
+    white: NDArray
 
     @property
     def effects(self) -> NDArray:
@@ -140,21 +157,28 @@ def identifiability(
 
     """
     flat = jacobian.reshape(-1, jacobian.shape[-1])
-    noise = np.sqrt(noise_of(residual, measured, len(names)))
     left, singular, directions = np.linalg.svd(flat, full_matrices=False)
     nonzero = singular > RANK_TOLERANCE * singular.max(initial=0.0)
+    covariance, freedom = score_covariance(left.reshape(jacobian.shape), residual, measured)
+    noise = np.sqrt(np.diag(covariance))
+    alike = covariance / np.maximum(np.outer(noise, noise), 1e-300)
     with np.errstate(divide="ignore", invalid="ignore"):
         uncertainty = np.where(nonzero, noise / singular, np.inf)
         # A direction does not concern a parameter in which it has no component.
         part = np.where(np.abs(directions) > 1e-6, directions, 0.0)
         scaled = np.where(part == 0, 0.0, part * uncertainty[:, None])
-        errors = np.sqrt(np.sum(scaled**2, axis=0))
+        finite = np.where(nonzero[:, None], scaled, 0.0)
+        errors = np.sqrt(np.sum(finite * (alike @ finite), axis=0))
+        errors = np.where(np.isinf(scaled).any(axis=0), np.inf, errors)
         # No direction is longer than the ranges. So one that is undetermined leaves a parameter
         # determined that hardly takes part in it.
         limited = part * np.minimum(uncertainty, 1.0)[:, None]
-        small = np.abs(part) <= NEGLIGIBLE
-        within = np.sqrt(np.sum(np.where(small, limited, scaled) ** 2, axis=0))
-        correlation = (scaled.T @ scaled) / np.outer(errors, errors)
+        limited = np.where(np.abs(part) <= NEGLIGIBLE, limited, scaled)
+        crossed = np.where(np.isfinite(limited), limited, 0.0)
+        within = np.sqrt(np.sum(crossed * (alike @ crossed), axis=0))
+        within = np.where(np.isinf(limited).any(axis=0), np.inf, within)
+        lengths = np.where(nonzero[:, None], part / singular[:, None], 0.0)
+        correlation = finite.T @ alike @ finite / np.outer(errors, errors)
     distance = np.abs(alternatives).max(axis=0, initial=0.0)
     determined = within < UNIFORM
     errors = np.where(determined, within, errors)
@@ -162,20 +186,102 @@ def identifiability(
     # Where a bound holds the optimum, a step of least squares without bounds leaves it.
     known = uncertainty < 1
     step = -(left[:, known].T @ residual.ravel() / singular[known]) @ directions[known]
-    rest = np.sqrt(noise_of(residual + jacobian @ step, measured, len(names)))
-    moved = np.abs(step) * noise > NORMAL_95 * errors * rest
+    rest = np.sum((residual + jacobian @ step) ** 2) / max(np.sum(residual**2), 1e-300)
+    moved = np.abs(step) > NORMAL_95 * errors * np.sqrt(rest)
     depends = at_bound.any() & ~at_bound & moved
+    # Degrees of freedom of a parameter are those of the direction that leaves it most uncertain.
+    weakest = np.argmax(np.abs(finite), axis=0)
     return Identifiability(
         names=names,
         errors=errors * width,
         correlation=correlation,
-        singular_values=singular / max(noise, 1e-300),
+        singular_values=singular / np.maximum(noise, 1e-300),
         directions=directions,
         at_bound=at_bound,
         depends=depends,
         identified=determined & agree & ~depends,
         independent=measured / correlation_time(residual),
+        freedom=freedom[weakest],
+        white=width * np.sqrt(variance_of(residual, measured, len(names)) * np.sum(lengths**2, 0)),
     )
+
+
+def score_covariance(score: NDArray, residual: NDArray, measured: int) -> tuple[NDArray, NDArray]:
+    """The covariance of sums of residuals that directions weight, and its degrees of freedom.
+
+    Residuals are an autoregression of first order, as their lag-one autocorrelation says, or
+    correlated in any way within blocks of time and independent between them, whichever gives the
+    wider interval: what a wrong twin leaves is slower than its steps from sample to sample.
+
+    Parameters
+    ----------
+    score : NDArray
+        (n, P, d_y, k), weights of k directions.
+    residual : NDArray
+        (n, P, d_y), 0 where nothing was measured.
+    measured : int
+        Number of measured values.
+
+    Returns
+    -------
+    covariance : NDArray
+        (k, k).
+    freedom : NDArray
+        (k,).
+
+    References
+    ----------
+    Bester, Conley and Hansen, "Inference with dependent data using cluster covariance estimators",
+    Journal of Econometrics 165, 2011.
+
+    """
+    size = score.shape[-1]
+    memory = lag_one(residual)
+    after = lfilter([1.0], [1.0, -memory], score, axis=1)
+    before = lfilter([1.0], [1.0, -memory], score[:, ::-1], axis=1)[:, ::-1]
+    flat = score.reshape(-1, size)
+    effect = flat.T @ (after + before - score).reshape(-1, size)
+    variance = variance_of(residual, measured, size)
+    covariance = variance * 0.5 * (effect + effect.T)
+    plain = np.maximum(np.diag(flat.T @ flat), 1e-300)
+    freedom = np.maximum(measured / np.maximum(np.diag(effect) / plain, 1e-300) - size, 1.0)
+    block = blocks_of(residual)
+    number = int(block.max()) + 1
+    weighted = score * residual[..., None]
+    sums = np.zeros((number, size))
+    np.add.at(sums, block.ravel(), weighted.sum(axis=2).reshape(-1, size))
+    sums -= sums.mean(axis=0)
+    count = np.zeros((number, size))
+    np.add.at(count, block.ravel(), (score**2).sum(axis=2).reshape(-1, size))
+    spread = number > 1 and (count.max(axis=0) < SHARED * np.maximum(count.sum(axis=0), 1e-300))
+    by_blocks = sums.T @ sums * number / max(number - 1, 1)
+    usual = np.maximum(np.diag(covariance), 1e-300)
+    factor = np.sqrt(np.where(spread, np.diag(by_blocks) / usual, 0.0))
+    few = np.minimum(freedom, max(number - 1.0, 1.0))
+    more = factor * student.ppf(0.975, few) > student.ppf(0.975, freedom)
+    factor = np.where(more, factor, 1.0)
+    return covariance * np.outer(factor, factor), np.where(more, few, freedom)
+
+
+def blocks_of(residual: NDArray) -> NDArray:
+    """The block of time (n, P) of each sample, of `BLOCKS` in all, with equally many measured."""
+    seen = np.any(residual != 0, axis=2)
+    number = max(1, -(-BLOCKS // len(residual)))
+    place = np.cumsum(seen, axis=1) - seen
+    own = place * number // np.maximum(seen.sum(axis=1, keepdims=True), 1)
+    return np.asarray(np.minimum(own, number - 1) + number * np.arange(len(residual))[:, None])
+
+
+def distinct(residual: NDArray) -> NDArray:
+    """Indices of the trajectories whose residuals (n, P, d_y) are no copy of an earlier one's."""
+    if residual.shape[1] < COMPARED:
+        return np.arange(len(residual))
+    seen = residual != 0
+    mean = residual.sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1)
+    flat = np.where(seen, residual - mean, 0.0).reshape(len(residual), -1)
+    size = np.linalg.norm(flat, axis=1)
+    alike = flat @ flat.T / np.maximum(np.outer(size, size), 1e-300)
+    return np.flatnonzero(np.tril(alike, -1).max(axis=1, initial=0.0) < COPY)
 
 
 def standard_errors(jacobian: NDArray, residual: NDArray) -> NDArray:
@@ -225,16 +331,26 @@ def standard_errors(jacobian: NDArray, residual: NDArray) -> NDArray:
     return np.where(open_, np.inf, errors)
 
 
+def variance_of(residual: NDArray, measured: int, free: int) -> float:
+    """Variance of the residuals after a fit of `free` parameters."""
+    return float(np.sum(residual**2)) / max(measured - free, 1)
+
+
 def noise_of(residual: NDArray, measured: int, free: int) -> float:
-    """Variance per effective sample of the residuals after a fit of `free` parameters."""
-    return float(np.sum(residual**2)) / max(measured - free, 1) * correlation_time(residual)
+    """The same per effective sample."""
+    return variance_of(residual, measured, free) * correlation_time(residual)
 
 
 def correlation_time(residual: NDArray) -> float:
     """Samples per effective one, from the lag-one autocorrelation of residuals (n, P, d_y)."""
+    correlation = lag_one(residual)
+    return (1 + correlation) / (1 - correlation)
+
+
+def lag_one(residual: NDArray) -> float:
+    """The lag-one autocorrelation of residuals (n, P, d_y), from 0 to `MAX_AUTOCORRELATION`."""
     power = float(np.sum(residual**2))
     if power == 0 or residual.shape[1] < 2:
-        return 1.0
+        return 0.0
     correlation = float(np.sum(residual[:, 1:] * residual[:, :-1])) / power
-    correlation = min(max(correlation, 0.0), MAX_AUTOCORRELATION)
-    return (1 + correlation) / (1 - correlation)
+    return min(max(correlation, 0.0), MAX_AUTOCORRELATION)

@@ -27,6 +27,7 @@ from retwin.update.identification.identifiability import (
     CHI2_95,
     MIN_TRAJECTORIES,
     Identifiability,
+    distinct,
     identifiability,
     noise_of,
     standard_errors,
@@ -72,7 +73,8 @@ class Updated:
         Duration of the identification.
     figures : dict of str to float
         `rms_before` and `rms_after` in output units (relative to each output's standard deviation
-        where units differ), `measurements`, `independent`, the effective sample size, and
+        where units differ), `measurements`, `independent`, the effective sample size,
+        `copies`, the trajectories that repeat another one, and
         `starts_agreeing`.
     reason : str
         Why the search ended, and the warnings.
@@ -217,7 +219,9 @@ def identify(
             found = infer_posterior(misfit, method, progress)
     else:
         found = _searched(twin, observed, method, horizon, (begin, missing, progress))
-        for note in filter(None, [found.identifiability.warning, missing]):
+        copies = int(found.figures["copies"])
+        again = f"{copies} of {len(observed)} trajectories are copies and count once"
+        for note in filter(None, [found.identifiability.warning, missing, again * bool(copies)]):
             warnings.warn(note, stacklevel=2)
     return replace(found, seconds=time.perf_counter() - began)
 
@@ -300,13 +304,14 @@ def _fitted(
     optima = search.run(np.random.default_rng(misfit.seed))
     best, point = optima[0]
     residual = misfit.residuals(np.array([best.values]))[0]
-    found, errors, agreeing = _identifiability(search, optima, point, residual)
+    once = distinct(residual)
+    found, errors, agreeing = _identifiability(search, optima, point, residual, once)
     # Starts draw all parameters; one without effect has no other value than the present one.
     kept = np.where(found.effects > 0, best.values, twin.values)
     if (kept != best.values).any():
         best = replace(best, values=tuple(kept.tolist()))
         optima = [(best, point), *optima[1:]]
-    count = len(misfit.observed)
+    count, copies = len(once), len(residual) - len(once)
     half = stats.t.ppf(0.975, max(count - 1, 1)) * errors
     values = np.array(best.values)
     if misfit.windows is not None:
@@ -334,6 +339,7 @@ def _fitted(
             "rms_after": misfit.rms_of(residual),
             "measurements": float(misfit.seen.sum()),
             "independent": found.independent,
+            "copies": float(copies),
             "starts_agreeing": float(agreeing),
         },
         reason="; ".join(filter(None, [best.reason, found.warning, missing, unknown])),
@@ -343,17 +349,25 @@ def _fitted(
 
 
 def _identifiability(
-    search: Search, optima: list[tuple[Optimum, NDArray]], best: NDArray, residual: NDArray
+    search: Search,
+    optima: list[tuple[Optimum, NDArray]],
+    best: NDArray,
+    residual: NDArray,
+    once: NDArray,
 ) -> tuple[Identifiability, NDArray, int]:
-    """The identifiability at the best optimum, its standard errors, and how many starts agree."""
+    """The identifiability at the best optimum, its standard errors, and how many starts agree.
+
+    Trajectories that are not among `once` are copies, and no information.
+    """
     misfit = search.misfit
     # Outliers have as little weight in the standard errors as they had in the optimum.
     _, residual, curvature = search.linearised(residual)
+    jacobian, width = search.jacobian(best).reshape(*residual.shape, -1), misfit.high - misfit.low
+    jacobian, residual, seen = jacobian[once], residual[once], misfit.seen[once]
     # As well as the best: within the 95 % range of the objective under noise (chi-square).
-    measured, lowest = int(misfit.seen.sum()), optima[0][0].objective ** 2
+    measured, lowest = int(seen.sum()), optima[0][0].objective ** 2
     margin = CHI2_95 * curvature * noise_of(residual, measured, len(best)) + 1e-6 * lowest
     alternatives = [point for each, point in optima if each.objective**2 <= lowest + margin]
-    jacobian, width = search.jacobian(best).reshape(*residual.shape, -1), misfit.high - misfit.low
     found = identifiability(
         misfit.twin.names,
         jacobian,

@@ -11,7 +11,7 @@ from scipy import stats
 from retwin.checks import one_of, whole
 from retwin.data.measured import measured_only
 from retwin.data.trajectories import Trajectories
-from retwin.update.identification.identifiability import CHI2_95, noise_of
+from retwin.update.identification.identifiability import CHI2_95, variance_of
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.misfit import misfit_of
 from retwin.update.identification.search import LeastSquares, Search
@@ -100,9 +100,10 @@ def profile(
     one_of("name", name, names)
     whole("points", points, least=3)
     which, observed = names.index(name), measured_only(observed)
-    error, limit, ratio = updated.identifiability.errors[which], CHI2_95, 1.0
+    local, limit = updated.identifiability, CHI2_95
+    error = local.errors[which]
     if np.isfinite(updated.errors[name]):
-        error, ratio = updated.errors[name], (updated.errors[name] / error) ** 2
+        error = updated.errors[name]
         limit = stats.t.ppf(0.975, len(observed) - 1) ** 2
     with misfit_of(updated.twin, observed, seed=0, rate=rate, processes=processes) as misfit:
         search = Search(misfit, LeastSquares(starts=1), None)
@@ -113,7 +114,8 @@ def profile(
         grid = np.unique(np.append(np.linspace(low, high, points), best[which]))
         sums = _profiled(search, which, grid, best)
         _, residual, curvature = search.linearised(misfit.residuals(search.theta(best[None]))[0])
-        noise = ratio * curvature * noise_of(residual, int(misfit.seen.sum()), len(names))
+        noise = curvature * variance_of(residual, int(misfit.seen.sum()), len(names))
+        noise *= (error / local.white[which]) ** 2 if np.isfinite(error) else 1.0
     return Profile(
         name,
         misfit.low[which] + search.width[which] * grid,

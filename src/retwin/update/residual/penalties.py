@@ -26,22 +26,26 @@ def penalties(model: Residual, mean: Tensor, valid: Tensor) -> Tensor:
         Its `bounds` are b, its `scale` the unit in which steps and excess are measured, and its
         `density` holds λ_s and λ_b.
     mean : Tensor
-        (n, M, d_z), z̄ over M segments or samples.
+        (..., n, M, d_z), z̄ over M segments or samples.
     valid : Tensor
-        (n, M) bool, what is averaged over.
+        (..., n, M) bool, what is averaged over.
 
     Returns
     -------
     Tensor
-        A scalar.
+        (...).
 
     """
-    step = (mean[:, 1:] - mean[:, :-1]) / model.scale
-    both = valid[:, 1:] & valid[:, :-1]
-    roughness = (step.square().sum(-1) * both).sum() / both.sum().clamp_min(1)
+    step = (mean[..., 1:, :] - mean[..., :-1, :]) / model.scale
     beyond = torch.relu(mean.abs() - model.bounds) / model.scale
-    excess = (beyond.square().sum(-1) * valid).sum() / valid.sum().clamp_min(1)
+    roughness = mean_where(step.square().sum(-1), valid[..., 1:] & valid[..., :-1])
+    excess = mean_where(beyond.square().sum(-1), valid)
     return model.density.smoothness * roughness + model.density.boundedness * excess
+
+
+def mean_where(values: Tensor, valid: Tensor) -> Tensor:
+    """The mean (...) of values (..., n, M) that are valid."""
+    return torch.where(valid, values, 0.0).sum((-2, -1)) / valid.sum((-2, -1)).clamp_min(1)
 
 
 def checked_bounds(bounds: NDArray, latent: Channels) -> Tensor:

@@ -8,7 +8,7 @@ network is trained with a past z that it does not have in simulation.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,6 +61,8 @@ class SequenceMixture:
     training : Training
         Settings of the training of each member, without early stopping; `batch_size` counts
         windows.
+    max_steps : int
+        Steps of the optimiser, at least 1: long records are trained on for fewer epochs.
 
     Raises
     ------
@@ -91,9 +93,10 @@ class SequenceMixture:
     training: Training = Training(  # noqa: RUF009 - frozen
         max_epochs=80, batch_size=6, learning_rate=5e-3, weight_decay=0.1
     )
+    max_steps: int = 2000
 
     def __post_init__(self) -> None:
-        counts = (self.features, self.components, self.block)
+        counts = (self.features, self.components, self.block, self.max_steps)
         sound = (
             min(counts) >= 1
             and self.members >= 2
@@ -105,7 +108,7 @@ class SequenceMixture:
         require(
             sound,
             "density",
-            expected="members of at least 2, features, components and block of at least 1, "
+            expected="members of at least 2, features, components, block, max_steps of at least 1, "
             "burn_in below window, dropout and moderation from 0 to 1",
             got=repr(self),
             remedy="leave out what you do not need to change",
@@ -134,13 +137,6 @@ class Member(nn.Module):
         self.heads = nn.ModuleList(
             MixtureHead(density.features, width, density.components) for width in widths
         )
-
-    def forward(
-        self, past: Tensor, shift: Sequence[Tensor], scale: Sequence[Tensor]
-    ) -> list[GaussianMixture]:
-        """The distribution of each block (n, T) for the past (n, T, d), in physical units."""
-        encoded = self.encoder(past)
-        return [head(encoded, *unit) for head, *unit in zip(self.heads, shift, scale, strict=True)]
 
 
 class SequenceResidual(Residual):
@@ -206,20 +202,32 @@ class SequenceResidual(Residual):
 
     def forward(self, context: Context) -> Blocks:
         """The distribution q_ψ(z_t | past of u and ŷ), members with equal weights."""
-        members = list(self.distributions(past(context)))
-        blocks = range(len(self.sizes))
-        return Blocks([_pooled([member[block] for member in members]) for block in blocks])
+        return Blocks([pool(block) for block in self.distributions(past(context))])
 
-    def distributions(self, features: Tensor) -> Iterator[list[GaussianMixture]]:
-        """Per member, the calibrated distribution of each block for the past (n, T, F)."""
+    def distributions(self, features: Tensor) -> list[GaussianMixture]:
+        """The calibrated distribution (K, n, T) of each block for the past (n, T, F), by member."""
         shift, trust = self.shift.split(self.sizes), self.trust.split(self.sizes)
-        for member in self.members:
-            yield widened(shrunk(self.predict(member, features), shift, trust), self.spread)
+        return widened(shrunk(self.predict(features), shift, trust), self.spread)
 
-    def predict(self, member: nn.Module, features: Tensor) -> list[GaussianMixture]:
-        """The distribution of each block that one member predicts, before calibration."""
-        units = self.shift.split(self.sizes), self.scale.split(self.sizes)
-        return member(self.before(features), *units)
+    def predict(self, features: Tensor) -> list[GaussianMixture]:
+        """What K members predict for each block, (K, n, T), before calibration.
+
+        Only the encoders run one after another: for networks this small, the time of everything
+        else is that of calls, whatever the size of the arrays.
+        """
+        members: Any = self.members
+        standard = self.before(features)
+        encoded = [member.encoder(standard) for member in members]
+        made = []
+        for block, unit in enumerate(zip(*self._units, strict=True)):
+            heads = [member.heads[block] for member in members]
+            raw = [head.linear(each) for head, each in zip(heads, encoded, strict=True)]
+            made.append(heads[0].mixture(torch.stack(raw), *unit))
+        return made
+
+    @property
+    def _units(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+        return self.shift.split(self.sizes), self.scale.split(self.sizes)
 
     @torch.no_grad()
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
@@ -228,13 +236,11 @@ class SequenceResidual(Residual):
         The normal noise that selects the component, and that within it, is autoregressive with
         `persistence`, so each z_t has the predicted marginal distribution.
         """
-        members = list(self.distributions(past(context)))
-        n, steps = members[0][0].batch_shape
+        blocks = self.distributions(past(context))
+        members, n, steps = blocks[0].batch_shape
         made: Any = {"generator": generator, "device": generator.device}
-        chosen = torch.randint(len(members), (n,), **made)
-        drawn_from = Blocks(
-            [_picked([each[block] for each in members], chosen) for block in range(len(self.sizes))]
-        )
+        chosen = torch.randint(members, (n,), **made)
+        drawn_from = Blocks([pick(block, chosen) for block in blocks])
         first = torch.stack([part[0] for part in self.persistence.split(self.sizes)])
         of_components = autoregressive(torch.randn(n, steps, len(first), **made), first)
         of_values = autoregressive(
@@ -269,24 +275,21 @@ def widened(blocks: Sequence[GaussianMixture], spread: Tensor | float) -> list[G
     ]
 
 
-def _pooled(members: Sequence[GaussianMixture]) -> GaussianMixture:
-    """The mixture of several mixtures with equal weights."""
-    logits = [each.mixture_distribution.logits.log_softmax(dim=-1) for each in members]
+def pool(members: GaussianMixture) -> GaussianMixture:
+    """The mixture (...) of K mixtures (K, ...) with equal weights."""
+    logits = members.mixture_distribution.logits.log_softmax(dim=-1)
     return GaussianMixture(
-        torch.cat(logits, dim=-1),
-        torch.cat([each.means for each in members], dim=-2),
-        torch.cat([each.factor for each in members], dim=-3),
+        logits.movedim(0, -2).flatten(-2),
+        members.means.movedim(0, -3).flatten(-3, -2),
+        members.factor.movedim(0, -4).flatten(-4, -3),
     )
 
 
-def _picked(members: Sequence[GaussianMixture], chosen: Tensor) -> GaussianMixture:
-    """For each trajectory the mixture of the member `chosen` (n,)."""
+def pick(members: GaussianMixture, chosen: Tensor) -> GaussianMixture:
+    """For each trajectory the mixture (n, T) of the member `chosen` (n,) of K, (K, n, T)."""
     row = torch.arange(len(chosen), device=chosen.device)
-    parts: Any = zip(
-        *((each.mixture_distribution.logits, each.means, each.factor) for each in members),
-        strict=True,
-    )
-    return GaussianMixture(*(torch.stack(part)[chosen, row] for part in parts))
+    parts = members.mixture_distribution.logits, members.means, members.factor
+    return GaussianMixture(*(part[chosen, row] for part in parts))
 
 
 def autoregressive(noise: Tensor, coefficients: Tensor) -> Tensor:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from itertools import count
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,13 @@ from retwin.nets.mixtures import Blocks
 from retwin.nets.training import Fit, Loss, isolated, train
 from retwin.progress import Progress
 from retwin.update.corrections import Context, Correction, Discrepancy
-from retwin.update.residual.penalties import BOUND_MARGIN, SMALLEST, checked_bounds, penalties
+from retwin.update.residual.penalties import (
+    BOUND_MARGIN,
+    SMALLEST,
+    checked_bounds,
+    mean_where,
+    penalties,
+)
 from retwin.update.residual.sequence import (
     SequenceMixture,
     SequenceResidual,
@@ -95,45 +99,43 @@ def fit_sequence(
         remedy="give longer records, fewer members, or shorter blocks",
     )
     _prepare(model, data, bounds, seed)
-    fitted = [identified & ~_dilated(part, density.margin) for part in held_out]
-    report = _counter(progress, (1 + density.refit) * len(fitted))
-    fits = _trained(model, data, fitted, seed, report)
+    fitted = torch.stack([identified & ~_dilated(part, density.margin) for part in held_out])
+    rounds = 1 + density.refit
+    fit = _train_members(model, data, fitted, seed, _part(progress, 0, rounds))
     figures = _calibrate(model, data, held_out)
     if density.refit:
         with isolated(seed + 1):
             model.members = model.fresh()
         _initialise(model, data, seed)
-        every = [identified] * len(fitted)
-        fits = _trained(model, data, every, seed + len(fitted), report)
+        every = identified.expand_as(fitted)
+        fit = _train_members(model, data, every, seed + 1, _part(progress, 1, rounds))
     model.emulated = used.emulated
-    model.fitted = _summary(fits, figures)
+    model.fitted = replace(fit, figures=figures, reason=f"{density.members} members, {fit.reason}")
     return model.eval()
 
 
-def _counter(progress: Progress | None, steps: int) -> Callable[[], None]:
-    """A function that reports progress when it is called after each of `steps` steps."""
-    done = count(1)
-    return lambda: progress(next(done) / steps) if progress is not None else None
+def _part(progress: Progress | None, done: int, rounds: int) -> Progress | None:
+    """The progress of one of several rounds."""
+    return progress and (lambda share: progress((done + share) / rounds))
 
 
-def _trained(
+def _train_members(
     model: SequenceResidual,
     data: _Records,
-    fitted: Sequence[Tensor],
+    fitted: Tensor,
     seed: int,
-    report: Callable[[], None],
-) -> list[Fit]:
-    """Train each member to the last epoch on the samples `fitted` (n, T).
+    progress: Progress | None,
+) -> Fit:
+    """Train all members together to the last epoch on their samples `fitted` (K, n, T).
 
-    The held-out part does not stop the training early, since the member is calibrated on it.
+    Held-out parts do not stop the training early, since members are calibrated on them. The loss is
+    a sum over members, so that gradients are those of each alone; the clipping is in proportion.
     """
-    fits = []
-    for k, (member, part) in enumerate(zip(model.members, fitted, strict=True)):
-        windows = data.windows(model.density, part)
-        how = model.density.training
-        fits.append(train(member, _objective(model), windows, None, how, seed=seed + k))
-        report()
-    return fits
+    how, windows = model.density.training, data.windows(model.density, fitted)
+    epochs = model.density.max_steps * how.batch_size // len(windows[0])
+    epochs = min(how.max_epochs, max(1, epochs))
+    how = replace(how, max_epochs=epochs, clip=how.clip * len(fitted) ** 0.5)
+    return train(model.members, _objective(model), windows, None, how, seed=seed, progress=progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +148,10 @@ class _Records:
     lengths: Tensor
 
     def windows(self, density: SequenceMixture, usable: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Features, z and flags of windows (m, W); samples of the burn-in are not flagged."""
+        """Features, z and flags of windows, (m, W, ·); samples of the burn-in are not flagged.
+
+        Usable samples and flags have one entry for each member, (K, n, T) and (m, W, K).
+        """
         longest = int(self.lengths.max())
         width = min(density.window, longest)
         stride = max(1, (width - density.burn_in) // 2)
@@ -157,8 +162,9 @@ class _Records:
         starts = torch.minimum(grid, last)[row, record][:, None]
         time = torch.arange(width)
         inside = record[:, None], starts + time
-        flags = usable[inside] & ((time >= density.burn_in) | (starts == 0))
-        some = flags.any(dim=1)
+        settled = (time >= density.burn_in) | (starts == 0)
+        flags = usable.movedim(0, -1)[inside] & settled[..., None]
+        some = flags.flatten(1).any(dim=1)
         return self.features[inside][some], self.z[inside][some], flags[some]
 
 
@@ -222,13 +228,12 @@ def _objective(model: SequenceResidual) -> Loss:
     """L_RG of Eq. 10 over t."""
     density = model.density
 
-    def loss(member: Any, batch: tuple[Tensor, ...]) -> Tensor:
-        features, z, used = batch
-        distribution = Blocks(model.predict(member, features))
+    def loss(_: Any, batch: tuple[Tensor, ...]) -> Tensor:
+        features, z, flags = batch
+        used, distribution = flags.movedim(-1, 0), Blocks(model.predict(features))
         deviation = (distribution.variance.sqrt() / model.scale).detach().mean(dim=-1)
         nll = -distribution.log_prob(z) * deviation ** (2 * density.moderation)
-        nll = torch.where(used, nll, 0.0).sum() / used.sum().clamp_min(1)
-        return nll + penalties(model, distribution.mean, used)
+        return (mean_where(nll, used) + penalties(model, distribution.mean, used)).sum()
 
     return loss
 
@@ -238,26 +243,19 @@ def _calibrate(model: SequenceResidual, data: _Records, held_out: Tensor) -> dic
     """Set shrinkage, spread and persistence from held-out parts; the figures of these parts."""
     model.eval()
     held_out = held_out & data.identified
-    predicted = [model.predict(member, data.features) for member in model.members]
-    means = torch.stack([Blocks(blocks).mean for blocks in predicted])
+    predicted = model.predict(data.features)
+    means = Blocks(predicted).mean
     z = data.z.expand_as(means)[held_out]
     model.trust.copy_(_trust(means[held_out] - model.shift, z - model.shift))
-    shift, trust = model.shift.split(model.sizes), model.trust.split(model.sizes)
-    predicted = [shrunk(blocks, shift, trust) for blocks in predicted]
+    predicted = shrunk(predicted, model.shift.split(model.sizes), model.trust.split(model.sizes))
 
     def log_likelihood(spread: float) -> float:
-        parts = zip(predicted, held_out, strict=True)
-        return float(
-            sum(
-                Blocks(widened(blocks, spread)).log_prob(data.z)[part].sum()
-                for blocks, part in parts
-            )
-        )
+        return float(Blocks(widened(predicted, spread)).log_prob(data.z)[held_out].sum())
 
     spread = max(SPREADS.tolist(), key=log_likelihood)
     model.spread.fill_(spread)
-    distributions = [Blocks(widened(blocks, spread)) for blocks in predicted]
-    scores = torch.stack([each.normal_scores(data.z) for each in distributions])
+    distribution = Blocks(widened(predicted, spread))
+    scores = distribution.normal_scores(data.z.expand_as(means))
     if model.density.persistent:
         model.persistence.copy_(_persistence(scores, held_out))
     figures = {
@@ -266,7 +264,7 @@ def _calibrate(model: SequenceResidual, data: _Records, held_out: Tensor) -> dic
         "spread": spread,
         "coverage90": float((scores[held_out].abs() < QUANTILE90).float().mean()),
     }
-    error = torch.stack([each.mean for each in distributions])[held_out] - z
+    error = distribution.mean[held_out] - z
     by_name = {
         "rmse_{}": error.square().mean(dim=0).sqrt(),
         "rmse_{}/constant": (z - model.shift).square().mean(dim=0).sqrt(),
@@ -295,9 +293,3 @@ def _persistence(scores: Tensor, held_out: Tensor) -> Tensor:
     power = 0.5 * (following.square() + current.square()).sum(dim=0)
     correlation = (following * current).sum(dim=0) / power.clamp_min(1e-9)
     return correlation.clamp(0.0, MAX_PERSISTENCE)
-
-
-def _summary(fits: list[Fit], figures: dict[str, float]) -> Fit:
-    """One record of the trainings of all members."""
-    history = {f"train {k + 1}": fit.history["train"] for k, fit in enumerate(fits)}
-    return Fit(figures, history, fits[0].best_epoch, f"{len(fits)} members, {fits[0].reason}")

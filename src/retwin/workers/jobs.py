@@ -18,8 +18,8 @@ from pebble import ProcessExpired
 from retwin.checks import needs_extra
 from retwin.errors import InputError
 from retwin.modules import add_known, known
-from retwin.processes import sendable_errors, worker_pool
 from retwin.progress import Progress
+from retwin.workers.pools import check_sendable, sendable_errors, worker_pool
 
 ATTEMPTS = 3
 """How often a chunk is begun while worker processes die, before that is an error."""
@@ -72,7 +72,12 @@ def each(
     if scheduler is None and workers == 1:
         yield from (task(job, number, progress) for number in numbers)
         return
-    _check_sendable(job)
+    check_sendable(
+        job,
+        "plan",
+        expected="a twin, sampler and faults that other processes can import",
+        remedy="define them in a module of their own, or use one worker",
+    )
     if scheduler is not None:
         with on_cluster(scheduler, task, job) as submit:
             yield from _as_they_come(submit, numbers)
@@ -207,15 +212,3 @@ def _on_worker(
 
 def _same(sent: Job) -> Job:
     return sent
-
-
-def _check_sendable(job: object) -> None:
-    try:
-        pickle.dumps(job)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise InputError(
-            "plan",
-            expected="a twin, sampler and faults that other processes can import",
-            got=str(error).splitlines()[0],
-            remedy="define them in a module of their own, or use one worker",
-        ) from None

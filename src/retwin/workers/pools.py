@@ -1,7 +1,7 @@
 """Worker processes that end with their parent and may hang or crash without ending it.
 
 And temporary folders that are removed when their process ends. Native code of unknown origin runs
-in the pools of `isolation`.
+in a `workers.process.ForeignProcess`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any
 
 from pebble import ProcessPool
 
-from retwin.errors import place_of
+from retwin.errors import InputError, place_of
 from retwin.modules import add_known, known
 
 
@@ -54,7 +54,7 @@ def worker_pool(
     """
     pool = ProcessPool(
         max_workers=workers,
-        initializer=_begin_with_modules,
+        initializer=_begin,
         initargs=(known(), start, arguments),
         context=_Spawn(),
     )
@@ -100,39 +100,37 @@ class _Spawn(SpawnContext):
         return self.locks[-1]
 
 
-def _begin_with_modules(modules: dict[str, str], *begin: Any) -> None:
-    """Find the modules of users that the parent found, of which tasks may be made."""
-    add_known(modules)
-    begin_worker(*begin)
-
-
-def begin_worker(
-    start: Callable[..., None] | None,
-    arguments: tuple[Any, ...],
-    orphaned: Callable[..., None] | None = None,
+def _begin(
+    modules: dict[str, str], start: Callable[..., None] | None, arguments: tuple[Any, ...]
 ) -> None:
-    """Begin a spawned process that ignores Ctrl-C and ends with its parent; see `worker_pool`.
+    """Begin a process that ignores Ctrl-C and ends with its parent; see `worker_pool`.
 
-    `orphaned` is called with `arguments` where the parent has ended, before the process ends.
+    It finds the modules of users that the parent found, of which tasks may be made.
     """
+    add_known(modules)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if os.name == "posix":
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    threading.Thread(target=_end_with_parent, args=(orphaned, arguments), daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     if start is not None:
         start(*arguments)
 
 
-def _end_with_parent(orphaned: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
+def _end_with_parent() -> None:
     """Wait for the parent process to end, then end: a parent that was killed ends no workers."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
-        try:
-            if orphaned is not None:
-                orphaned(*arguments)
-        finally:
-            os._exit(1)
+        os._exit(1)
+
+
+def check_sendable(value: object, argument: str, *, expected: str, remedy: str) -> None:
+    """Refuse what cannot be pickled for a worker, as the InputError of these parts."""
+    try:
+        pickle.dumps(value)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        got = " ".join(str(error).split())
+        raise InputError(argument, expected=expected, got=got, remedy=remedy) from None
 
 
 @contextmanager

@@ -1,0 +1,120 @@
+"""`IsolatedPool`: processes for native code that nobody here has seen."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from numpy.typing import NDArray
+
+from retwin.serialisation.sizes import Budget
+from retwin.workers.process import (
+    FOREIGN,
+    ForeignProcess,
+    Frame,
+    ProcessEnded,
+    Retired,
+)
+
+START_TIME = 120.0
+"""Duration in s after which a process that has not begun is ended. It is long, since a computer
+that is short of memory may need that long to import Python's packages."""
+OVERHEAD = 2**22
+"""Bytes that an answer may take besides its arrays."""
+
+
+class IsolatedPool:
+    """A pool of processes, each with a connection of its own; `close` ends them.
+
+    Parameters
+    ----------
+    workers : int
+        The largest number of processes; each is started when it is needed.
+    folder : str
+        A folder that the processes remove where this process has died.
+    task, about
+        What a process does first; see `ForeignProcess.ask`.
+
+    Attributes
+    ----------
+    notes : list of str
+        Messages of the processes that retired.
+
+    """
+
+    def __init__(self, workers: int, folder: str, task: str, about: Any) -> None:
+        self.notes: list[str] = []
+        self._folder, self._begin = folder, (task, about)
+        self._threads = ThreadPoolExecutor(workers)
+        self._own = threading.local()
+        self._all: set[ForeignProcess] = set()
+        self._closed = False
+
+    def schedule(
+        self, task: str, about: Any, arrays: Sequence[NDArray] = (), *, timeout: float, size: int
+    ) -> Future[Frame]:
+        """The one frame that a task yields, in the future.
+
+        Parameters
+        ----------
+        task, about, arrays
+            See `ForeignProcess.ask`.
+        timeout : float
+            Duration in s after which the process is ended; its start is not included.
+        size : int
+            Largest size of the answer's arrays in bytes.
+
+        Returns
+        -------
+        concurrent.futures.Future
+            The answer; `TimeoutError` after that duration, `ProcessEnded` if the process ends.
+
+        """
+        return self._threads.submit(self._ask, (task, about, arrays), timeout, size)
+
+    def close(self) -> None:
+        """End all processes; tasks that have not begun are dropped."""
+        self._closed = True
+        for process in list(self._all):
+            process.kill()
+        self._threads.shutdown(cancel_futures=True)
+        for process in list(self._all):
+            process.end()
+
+    def _ask(self, task: tuple[Any, ...], timeout: float, size: int) -> Frame:
+        """Have a task done by this thread's process.
+
+        A process that retires is replaced, and so is one that ends during a task that was not its
+        first: the outcome must not depend on what a process did before.
+        """
+        while True:
+            process: ForeignProcess | None = getattr(self._own, "process", None)
+            fresh = process is None
+            try:
+                if process is None:
+                    process = self._own.process = ForeignProcess(self._folder)
+                    self._all.add(process)
+                    if self._closed:  # after `close` has killed the others
+                        process.kill()
+                    _one(process, self._begin, START_TIME, 0)
+                return _one(process, task, timeout, size)
+            except BaseException as error:
+                if process is not None:
+                    process.end()
+                    self._all.discard(process)
+                self._own.process = None
+                if fresh or not isinstance(error, Retired | ProcessEnded):
+                    raise
+                self.notes += error.args if isinstance(error, Retired) else ()
+
+
+def _one(process: ForeignProcess, task: tuple[Any, ...], timeout: float, size: int) -> Frame:
+    """The one frame of a task."""
+    take = Budget("answer", size + OVERHEAD).take
+    try:
+        (frame,) = process.ask(*task, take=take, timeout=timeout)
+    except ValueError:  # it is too large, or not one
+        raise ProcessEnded(FOREIGN) from None
+    return frame
