@@ -48,9 +48,9 @@ class YawPitchArm:
             End-effector position in m.
 
         """
-        yaw, pitch, links, radius = self._in_plane(angles)
-        height = np.cos(pitch) @ links
-        return np.stack([np.sin(yaw) * radius, -np.cos(yaw) * radius, self.base + height], axis=-1)
+        radius, height = np.moveaxis(self.in_plane(angles[..., 1:]), -1, 0)
+        sine, cosine = np.sin(angles[..., 0]), np.cos(angles[..., 0])
+        return np.stack([sine * radius, -cosine * radius, self.base + height], axis=-1)
 
     def jacobian(self, angles: NDArray) -> NDArray:
         """Jacobian of `position`.
@@ -66,19 +66,48 @@ class YawPitchArm:
             Derivatives in m/rad.
 
         """
-        yaw, pitch, links, radius = self._in_plane(angles)
-        sine, cosine = np.sin(yaw), np.cos(yaw)
-        # A pitch joint rotates every link behind it: sums from the tip inwards.
-        d_radius = np.cumsum((np.cos(pitch) * links)[..., ::-1], axis=-1)[..., ::-1]
-        d_height = -np.cumsum((np.sin(pitch) * links)[..., ::-1], axis=-1)[..., ::-1]
+        radius = self.in_plane(angles[..., 1:])[..., 0]
+        sine, cosine = np.sin(angles[..., 0]), np.cos(angles[..., 0])
+        d_radius, d_height = np.moveaxis(self.jacobian_in_plane(angles[..., 1:]), -2, 0)
         by_yaw = np.stack([cosine * radius, sine * radius, np.zeros_like(radius)], axis=-1)
         by_pitch = np.stack(
             [sine[..., None] * d_radius, -cosine[..., None] * d_radius, d_height], axis=-2
         )
         return np.concatenate([by_yaw[..., None], by_pitch], axis=-1)
 
-    def _in_plane(self, angles: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Yaw, pitch of each link, lengths of the links, and distance of the tip from the axis."""
-        pitch = np.cumsum(angles[..., 1:], axis=-1)
-        links = np.asarray(self.links, dtype=angles.dtype)
-        return angles[..., 0], pitch, links, np.sin(pitch) @ links
+    def in_plane(self, angles: NDArray) -> NDArray:
+        """Forward kinematics of the pitch joints in the arm's vertical plane.
+
+        Parameters
+        ----------
+        angles : ndarray, shape (..., links)
+            Angles of the pitch joints in rad.
+
+        Returns
+        -------
+        ndarray, shape (..., 2)
+            Signed distance of the end-effector from the yaw axis, and its height above the first
+            pitch joint, in m.
+
+        """
+        pitch, links = np.cumsum(angles, axis=-1), np.asarray(self.links, dtype=angles.dtype)
+        return np.stack([np.sin(pitch) @ links, np.cos(pitch) @ links], axis=-1)
+
+    def jacobian_in_plane(self, angles: NDArray) -> NDArray:
+        """Jacobian of `in_plane`.
+
+        Parameters
+        ----------
+        angles : ndarray, shape (..., links)
+            Angles of the pitch joints in rad.
+
+        Returns
+        -------
+        ndarray, shape (..., 2, links)
+            Derivatives in m/rad.
+
+        """
+        pitch, links = np.cumsum(angles, axis=-1), np.asarray(self.links, dtype=angles.dtype)
+        # A pitch joint rotates every link behind it: sums from the tip inwards.
+        each = np.stack([np.cos(pitch) * links, -np.sin(pitch) * links], axis=-2)
+        return np.cumsum(each[..., ::-1], axis=-1)[..., ::-1]

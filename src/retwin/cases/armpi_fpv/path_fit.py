@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
-from retwin.cases.armpi_fpv.plane import FLOOR, LIMIT, STEP, TIE, TURN, Plane, grid_chain
-from retwin.cases.armpi_fpv.search import free_chain
+from retwin.cases.armpi_fpv.plane import LIMIT, STEP, TURN, Plane
+from retwin.cases.armpi_fpv.search import FLOOR, TIE, free_chain, grid_chain
 from retwin.cases.armpi_fpv.twin import KINEMATIC, RAMPS, STRAIGHT
 from retwin.twins.ramps import ramps_and_holds
 
@@ -42,6 +42,18 @@ def path_noise(path: NDArray) -> NDArray:
     speed = np.linalg.norm(np.diff(path, axis=1), axis=2)
     # The arm rests for at least a quarter of its paths.
     return np.minimum(np.quantile(speed, 0.25, axis=1), LARGEST_NOISE)
+
+
+def _hats(part: NDArray) -> NDArray:
+    """Weights (..., 2) of the rests before and after a ramp with these finished fractions."""
+    return np.stack([1 - part, part], axis=-1)
+
+
+def _means(values: NDArray, low: NDArray, high: NDArray) -> NDArray:
+    """Mean (n, k) of values (n, T) from samples `low` to before samples `high`, both (n, k)."""
+    total = np.cumsum(np.pad(values, ((0, 0), (1, 0))), axis=1)
+    span = np.take_along_axis(total, high, axis=1) - np.take_along_axis(total, low, axis=1)
+    return span / (high - low)
 
 
 class PathFit:
@@ -154,22 +166,15 @@ class PathFit:
 
     def _per_movement(self, values: NDArray) -> NDArray:
         """Mean (n, M) of values (n, T) from just before a movement to just after it."""
-        total = np.cumsum(np.pad(values, ((0, 0), (1, 0))), axis=1)
-        low, high = np.maximum(self.first - 1, 0), np.minimum(self.last + 3, self.length)
-        span = np.take_along_axis(total, high, axis=1) - np.take_along_axis(total, low, axis=1)
-        return span / (high - low)
+        return _means(values, np.maximum(self.first - 1, 0), np.minimum(self.last + 3, self.length))
 
     def _rests(self) -> tuple[NDArray, NDArray]:
         """Mean radius and height (n, M + 1, 2) of the rests in m, and their tolerance (n,)."""
         none = np.zeros((self.count, 1), dtype=int)
         low = np.concatenate([none, self.last + 1], axis=1)
-        high = np.concatenate([self.first, none + self.length - 1], axis=1)
-        where = []
-        for signal in (self.radius, self.height):
-            total = np.cumsum(np.pad(signal, ((0, 0), (1, 0))), axis=1)
-            sums = np.take_along_axis(total, high + 1, 1) - np.take_along_axis(total, low, 1)
-            where.append(sums / (high + 1 - low))
-        return np.stack(where, axis=2), ROUNDING + path_noise(self.path)
+        high = np.concatenate([self.first + 1, none + self.length], axis=1)
+        rests = [_means(signal, low, high) for signal in (self.radius, self.height)]
+        return np.stack(rests, axis=2), ROUNDING + path_noise(self.path)
 
     def _kinks(self) -> NDArray:
         """Where the path has the kink at the end of a ramp (n, M, 3), well above the tolerance."""
@@ -201,21 +206,19 @@ class PathFit:
         yaw_error = self._yaw_error(index, parts)
         row = np.arange(self.count)[:, None, None]
         rests, self.tolerance = self._rests()
+        samples = np.stack([self.radius[row, index], self.height[row, index]], axis=-1)
         plane = Plane(
-            self.arm.links, self.radius[row, index], self.height[row, index], parts,
-            rests, self.tolerance, self._kinks(), yaw_error.min(axis=2),
-        )  # fmt: skip
-        plane = plane.rows(rows)
-        whole, found = grid_chain(plane)
+            self.arm, samples, parts, rests, self.tolerance, self._kinks(), yaw_error.min(axis=2)
+        )
+        found = grid_chain(plane, rows)
         # A single rest may be near the grid by coincidence, all rests of a path are not.
-        good: NDArray = np.all(found.cost < EXPLAINED**2, axis=1)
-        whole[whole] = good
-        self.whole[rows] = whole
-        free = free_chain(plane.rows(~whole), effort)
-        for some, solution in ((rows[whole], found.rows(good)), (rows[~whole], free)):
-            self.steps[some, :, 1:] = solution.postures.clip(-LIMIT, LIMIT)
-            self.index[some, :, 1:] = solution.lengths
-            self.tied[some] = solution.tied
+        found = found.rows((found.cost < EXPLAINED**2).all(axis=1))
+        self.whole[rows], self.whole[found.path] = False, True
+        free = free_chain(plane, rows[~self.whole[rows]], effort)
+        for each in (found, free):
+            self.steps[each.path, :, 1:] = each.postures.clip(-LIMIT, LIMIT)
+            self.index[each.path, :, 1:] = each.lengths
+            self.tied[each.path] = each.tied
         self._set_yaw(rows, parts, yaw_error)
 
     def _yaw_error(self, index: NDArray, parts: NDArray) -> NDArray:
@@ -223,32 +226,28 @@ class PathFit:
         row = np.arange(self.count)[:, None, None]
         self.weight = np.where(self.determined[row, index], self.radius[row, index] ** 2, 0)
         self.angle = self.yaw[row, index] / STEP
-        w, y = self.weight[:, :, None], self.angle[:, :, None]
-        a, b = 1 - parts, parts
-        aa, ab, bb = ((w * u * v).sum(-1) for u, v in ((a, a), (a, b), (b, b)))
-        ay, by = (w * a * y).sum(-1), (w * b * y).sum(-1)
-        aa, bb = aa + REGULARISATION, bb + REGULARISATION
-        det = aa * bb - ab**2
-        old, new = (bb * ay - ab * by) / det, (aa * by - ab * ay) / det
-        fit = old[..., None] * a + new[..., None] * b
-        return (w * (y - fit) ** 2).mean(axis=-1) * STEP**2
+        root = np.sqrt(self.weight)[:, :, None, :, None]
+        design, target = root * _hats(parts), root * self.angle[:, :, None, :, None]
+        # Where all weights are 0, so is the pseudo-inverse.
+        fit = design @ (np.linalg.pinv(design) @ target)
+        return ((target - fit) ** 2).mean(axis=(3, 4)) * STEP**2
 
     def _set_yaw(self, rows: NDArray, parts: NDArray, error: NDArray) -> None:
         """Ramps and rests of the yaw motor, by weighted least squares over each path."""
-        moves = np.arange(self.moves)
         parts, error, weight, angle = parts[rows], error[rows], self.weight[rows], self.angle[rows]
         length = np.argmin(error, axis=2)
-        part = np.take_along_axis(parts, length[..., None, None], axis=2)[:, :, 0]
-        matrix = np.zeros((rows.size, self.moves + 1, self.moves + 1))
-        vector = np.zeros((rows.size, self.moves + 1))
-        hats = (1 - part, part)
-        for i in range(2):
-            vector[:, moves + i] += (weight * hats[i] * angle).sum(axis=2)
-            for j in range(2):
-                matrix[:, moves + i, moves + j] += (weight * hats[i] * hats[j]).sum(axis=2)
+        hats = _hats(np.take_along_axis(parts, length[..., None, None], axis=2)[:, :, 0])
+        root = np.sqrt(weight)[..., None]
+        design = np.zeros((*angle.shape, self.moves + 1))
+        for move in range(self.moves):
+            design[:, move, :, move : move + 2] = (root * hats)[:, move]
+        design = design.reshape(rows.size, -1, self.moves + 1)
+        transposed = design.swapaxes(1, 2)
+        matrix = transposed @ design
+        vector = transposed @ (root * angle[..., None]).reshape(rows.size, -1, 1)
         # Where the data do not determine the yaw, the regularisation makes it straight.
         inverse = np.linalg.inv(matrix + REGULARISATION * np.eye(self.moves + 1))
-        yaw = (inverse @ vector[..., None])[..., 0]
+        yaw = (inverse @ vector)[..., 0]
         if self.moves == 0:
             yaw[:, 0] = np.median(self.yaw[rows], axis=1) / STEP * self.determined[rows].any(axis=1)
         whole = self.whole[rows, None]

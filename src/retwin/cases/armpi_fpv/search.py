@@ -1,9 +1,10 @@
-"""Continuous postures of the arm in its plane, found by Gauss-Newton over ramp combinations.
+"""The search for postures and ramps that explain paths, movement by movement.
 
-For targets that are not whole command units, as in the simulated paths. The search goes movement
-by movement, from every direction that the last link may have at the next rest and for every
-combination of ramps that agrees with the kinks of the path. A few explanations are kept until
-later movements decide between them.
+A few explanations are kept until later movements decide between them. Two facts make them unique:
+targets of the real robot are whole command units, which are enumerated (`grid_chain`). Simulated
+targets are continuous: there the ramps decide, by Gauss-Newton from every direction that the last
+link may have at the next rest, for every combination of ramps that agrees with the kinks of the
+path (`free_chain`).
 """
 
 from __future__ import annotations
@@ -13,309 +14,325 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.cases.armpi_fpv.plane import (
-    COMBINATIONS,
-    FLOOR,
-    LIMIT,
-    STEP,
-    TIE,
-    TURN,
-    Plane,
-    PlaneSolution,
-    bends,
-    forward,
-    grid_postures,
-    with_tip,
-)
+from retwin.cases.armpi_fpv.gauss_newton import gauss_newton
+from retwin.cases.armpi_fpv.plane import LIMIT, STEP, TURN, Plane, attain, bends, grid_postures
 
+TIE = 1.21
+"""Ratio of mean square errors below which two explanations count as equally good (10 % in RMS)."""
+FLOOR = 1e-18
+"""Mean square error in m^2 below which explanations count as equally good: double precision."""
+COMBINATIONS = np.stack([axis.ravel() for axis in np.indices((3, 3, 3))], axis=1)
+"""Combinations (27, 3) of ramp durations: the index of each motor's duration."""
+DURATIONS_USED = (COMBINATIONS[:, None] == np.arange(3)[:, None]).any(axis=2)
+"""Which (27, 3) of the three ramp durations occur in a combination."""
 REFINED_GUESSES = 8
 """Number of explanations per path that are refined where none is good."""
 KEPT_GUESSES = 4
 """Number of explanations per path that are kept from one movement to the next."""
+GRID_GUESSES = 24
+"""The same on the grid, where each costs little."""
 STARTS_PER_COMBINATION = 8
 """Number of local minima of the coarse scan from which each combination of ramps is fitted."""
 DIRECTIONS = 90
 """Number of directions of the last link from which the search starts, 4 degrees apart."""
-DURATIONS_USED = (COMBINATIONS[:, None] == np.arange(3)[:, None]).any(axis=2)
-"""Which (27, 3) of the three ramp durations occur in a combination."""
 
 
-@dataclass
-class _Guesses:
-    """Explanations that are kept: the path (g,) of each and its `PlaneSolution` so far."""
+@dataclass(frozen=True)
+class Explanations:
+    """Postures and ramps that explain paths of M movements.
+
+    Attributes
+    ----------
+    path : ndarray of int, shape (g,)
+        Path of each explanation.
+    postures : ndarray, shape (g, M + 1, 3)
+        Postures of the rests in steps.
+    lengths : ndarray of int, shape (g, M, 3)
+        Index of each motor's ramp duration.
+    cost : ndarray, shape (g, M)
+        Mean square error of each movement in m^2.
+    tied : ndarray of bool, shape (g, M)
+        Movements that another explanation fits equally well.
+
+    """
 
     path: NDArray
-    found: PlaneSolution
+    postures: NDArray
+    lengths: NDArray
+    cost: NDArray
+    tied: NDArray
 
-    def keep(self, rows: NDArray) -> _Guesses:
+    @classmethod
+    def of(cls, path: NDArray, posture: NDArray, moves: int) -> Explanations:
+        """Arms that rest in postures (g, 3)."""
+        shape = (len(path), moves)
+        rest = np.repeat(posture[:, None], moves + 1, axis=1)
+        none = np.zeros((*shape, 3), dtype=int)
+        return cls(path, rest, none, np.zeros(shape), np.zeros(shape, dtype=bool))
+
+    def rows(self, rows: NDArray) -> Explanations:
         """Select explanations."""
-        return _Guesses(self.path[rows], self.found.rows(rows))
+        return Explanations(*(each[rows] for each in vars(self).values()))
+
+    def join(self, other: Explanations) -> Explanations:
+        """The explanations of both."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Explanations(*map(np.concatenate, pairs))
+
+    def extend(
+        self, rows: NDArray, move: int, posture: NDArray, lengths: NDArray, cost: NDArray
+    ) -> Explanations:
+        """Some explanations, with what comes after a movement."""
+        more = self.rows(rows)
+        more.postures[:, move + 1], more.lengths[:, move], more.cost[:, move] = (
+            posture, lengths, cost,
+        )  # fmt: skip
+        return more
 
 
-def free_chain(plane: Plane, effort: int = 1) -> PlaneSolution:
+def grid_chain(plane: Plane, paths: NDArray) -> Explanations:
+    """Find whole-step postures.
+
+    Parameters
+    ----------
+    plane : Plane
+        All paths.
+    paths : ndarray of int
+        Index of the paths that are explained.
+
+    Returns
+    -------
+    Explanations
+        The best explanation of each path that has a posture on whole steps for every rest.
+
+    """
+    moves = plane.noise.shape[1]
+    guesses = Explanations.of(*grid_postures(plane, paths, 0), moves)
+    for move in range(moves):
+        owner, posture = grid_postures(plane, np.unique(guesses.path), move + 1)
+        guess, at = np.nonzero(guesses.path[:, None] == owner)
+        old, new = guesses.postures[guess, move], posture[at]
+        ends = np.stack([old, new], axis=1)
+        cost = np.empty((guess.size, len(COMBINATIONS)))
+        for i, lengths in enumerate(COMBINATIONS):
+            part, data = _movements(plane, owner[at], slice(move, move + 1), lengths[None, None])
+            cost[:, i] = _costs(_errors(plane, ends, part, data))[:, 0]
+        # A motor that stays has no ramp: leave one combination of the equal ones.
+        idle = ((old == new)[:, None] & (COMBINATIONS > 0)).any(axis=2)
+        pair, combination = np.nonzero(~idle)
+        more = guesses.extend(
+            guess[pair], move, new[pair], COMBINATIONS[combination], cost[pair, combination]
+        )
+        guesses = _best(plane, more, GRID_GUESSES, 4.0)
+    return _decided(plane, guesses)
+
+
+def free_chain(plane: Plane, paths: NDArray, effort: int = 1) -> Explanations:
     """Find continuous postures, movement by movement and then for a whole path together.
 
     Parameters
     ----------
     plane : Plane
-        n paths.
+        All paths.
+    paths : ndarray of int
+        Index of the paths that are explained.
     effort : int, default 1
         Factor of the number of starts and of the number of explanations that are kept.
 
     Returns
     -------
-    PlaneSolution
+    Explanations
         The best explanation of each path.
 
     """
-    count, moves = plane.noise.shape
-    on_grid, postures = _starts(plane)
-    found = PlaneSolution(
-        np.repeat(postures[:, None], moves + 1, axis=1), np.zeros((count, moves, 3), dtype=int),
-        np.zeros((count, moves)), np.zeros((count, moves), dtype=bool),
-    )  # fmt: skip
-    guesses = _Guesses(np.arange(count), found)
+    moves = plane.noise.shape[1]
+    guesses, on_grid = _starts(plane, paths)
     for move in range(moves):
         # At every kink the ramp of a motor ends, and no ramp ends elsewhere.
         kinks = plane.kinks[guesses.path, move]
         fits = (kinks[:, None] == DURATIONS_USED).all(axis=2)
         more = _search(plane, move, guesses, fits, effort, 12)
-        best = np.full(count, np.inf)
-        np.minimum.at(best, more.path, more.found.cost[:, move])
+        best = np.full(len(plane.noise), np.inf)
+        np.minimum.at(best, more.path, more.cost[:, move])
         # Where none of these explains the movement, either the kinks are wrong, so that all
         # combinations are tried, or the rest before is inaccurate, so that all movements so far
         # are fitted together.
         poor = best > plane.tolerance**2 / 4
-        again = guesses.keep(poor[guesses.path])
+        again = guesses.rows(poor[guesses.path])
         every = np.ones((again.path.size, 27), dtype=bool)
-        other = _search(plane, move, again, every, effort, 40)
-        other = _join(more.keep(poor[more.path]), other)
-        other = _best(plane, move, other, REFINED_GUESSES * effort, np.inf)
+        other = more.rows(poor[more.path]).join(_search(plane, move, again, every, effort, 40))
+        other = _best(plane, other, REFINED_GUESSES * effort, np.inf)
         _refine(plane, other, on_grid, move + 1, 12)
-        more = _join(more.keep(~poor[more.path]), other)
         # A rest that the arm cannot attain: the posture is kept and then refined.
-        lost = guesses.keep(~np.isin(guesses.path, more.path))
-        lost.found.postures[:, move + 1] = lost.found.postures[:, move]
-        guesses = _best(plane, move, _join(more, lost), KEPT_GUESSES * effort, 4.0)
+        more = more.rows(~poor[more.path]).join(other)
+        lost = np.flatnonzero(~np.isin(guesses.path, more.path))
+        more = more.join(guesses.extend(lost, move, guesses.postures[lost, move], 0, 0.0))
+        guesses = _best(plane, more, KEPT_GUESSES * effort, 4.0)
     _refine(plane, guesses, on_grid, moves, 4)
     return _decided(plane, guesses)
 
 
-def _join(one: _Guesses, two: _Guesses) -> _Guesses:
-    """The explanations of both."""
-    return _Guesses(np.concatenate([one.path, two.path]), one.found.join(two.found))
-
-
-def _best(plane: Plane, move: int, guesses: _Guesses, number: int, margin: float) -> _Guesses:
-    """The best explanations per path, up to a movement, of about equal cost."""
-    total = guesses.found.cost.sum(axis=1)
-    same = np.concatenate([
-        guesses.path[:, None], guesses.found.lengths[:, move],
-        np.rint(guesses.found.postures[:, move: move + 2].reshape(-1, 6) / 2),
-    ], axis=1)  # fmt: skip
+def _best(plane: Plane, guesses: Explanations, number: int, margin: float) -> Explanations:
+    """The best explanations per path of about equal cost."""
+    total = guesses.cost.sum(axis=1)
     order = np.lexsort((total, guesses.path))
-    _, first = np.unique(same[order], axis=0, return_index=True)
-    order = order[np.sort(first)]
-    path = guesses.path[order]
+    path, total = guesses.path[order], total[order]
     begin = np.searchsorted(path, path)
-    close = total[order] <= 2 * total[order][begin] + margin * plane.tolerance[path] ** 2
-    return guesses.keep(order[close & (np.arange(path.size) - begin < number)])
+    allowed = plane.tolerance[path] ** 2 + plane.noise[path].sum(axis=1)
+    close = total <= 2 * total[begin] + margin * allowed
+    return guesses.rows(order[close & (np.arange(path.size) - begin < number)])
 
 
-def _decided(plane: Plane, guesses: _Guesses) -> PlaneSolution:
+def _decided(plane: Plane, found: Explanations) -> Explanations:
     """The best explanation of each path; movements that another one explains as well are tied."""
-    found, path = guesses.found, guesses.path
     total = found.cost.sum(axis=1)
-    order = np.lexsort((total, path))
-    chosen = order[np.searchsorted(path[order], np.arange(len(plane.noise)))]
-    best = found.rows(chosen)
-    limit = (TIE - 1) * (best.cost + plane.noise) + FLOOR + total[chosen, None]
-    far = np.abs(found.postures - best.postures[path]) > 0.5
-    differs: NDArray = np.any(far[:, 1:], axis=2)
+    order = np.lexsort((total, found.path))
+    paths, first, group = np.unique(found.path[order], return_index=True, return_inverse=True)
+    found, total = found.rows(order), total[order]
+    best = found.rows(first)
+    limit = (TIE - 1) * (best.cost + plane.noise[paths]) + FLOOR + total[first, None]
+    far = (np.abs(found.postures - best.postures[group]) > 0.5).any(axis=2)
+    differs = far[:, 1:]
+    differs[:, :1] |= far[:, :1]
     stays = np.abs(np.diff(found.postures, axis=1)) < 0.5
-    differs |= np.any((found.lengths != best.lengths[path]) & ~stays, axis=2)
-    np.logical_or.at(best.tied, path, differs & (total[:, None] <= limit[path]))
+    differs |= ((found.lengths != best.lengths[group]) & ~stays).any(axis=2)
+    np.logical_or.at(best.tied, group, differs & (total[:, None] <= limit[group]))
     return best
 
 
 def _search(
-    plane: Plane, move: int, guesses: _Guesses, fits: NDArray, effort: int, starts: int
-) -> _Guesses:
+    plane: Plane, move: int, guesses: Explanations, fits: NDArray, effort: int, starts: int
+) -> Explanations:
     """Ramps among those that fit (g, 27), and next postures, for one movement of guesses."""
-    links = plane.links
-    directions = DIRECTIONS * min(effort, 2)
-    scan, usable = _curve(plane.rests[guesses.path, move + 1], links, directions)
+    scan, usable = _curve(plane, guesses.path, move + 1, DIRECTIONS * min(effort, 2))
     guess, combination = np.nonzero(fits & np.any(usable, axis=1, keepdims=True))
-    path = guesses.path[guess]
-    old = guesses.found.postures[guess, move]
-    part = np.take_along_axis(
-        plane.parts[path, move], COMBINATIONS[combination][..., None], axis=1
-    ).swapaxes(1, 2)
-    data = np.stack([plane.radius[path, move], plane.height[path, move]], axis=-1)
-    pick, at = np.nonzero(usable[guess])
-    coarse, half = slice(4, None, 6), slice(None, None, 2)
-    cost = np.full((guess.size, 2, directions), np.inf)
+    old, lengths = guesses.postures[guess, move], COMBINATIONS[combination]
+    at = slice(move, move + 1)
+    part, data = _movements(plane, guesses.path[guess], at, lengths[:, None])
     # A movement that the end of the path cuts off is extrapolated to its target.
-    done = np.maximum(part[:, -1], 0.05)
+    done = np.maximum(part[:, 0, -1], 0.05)
+    coarse, half = slice(4, None, 6), slice(None, None, 2)
 
-    def begin(which: NDArray, at: NDArray) -> NDArray:
-        return old[which] + (scan[guess[which], at] - old[which]) / done[which]
+    def postures(which: NDArray, nth: NDArray) -> NDArray:
+        new = old[which] + (scan[guess[which], nth] - old[which]) / done[which]
+        return np.stack([old[which], new], axis=1)
 
-    error = _misfit(old[pick], begin(pick, at), part[pick, coarse], data[pick, coarse], links)
-    cost.reshape(guess.size, 2 * directions)[pick, at] = error[1]
-    # The fits start from the lowest local minima of each combination.
+    pick, nth = np.nonzero(usable[guess])
+    few = part[pick][:, :, coarse], data[pick][:, :, coarse]
+    cost = np.full((guess.size, *usable.shape[1:]), np.inf)
+    cost[pick, nth] = _costs(_errors(plane, postures(pick, nth), *few))[:, 0]
+    # The fits start from the lowest local minima of each combination, of either elbow.
+    cost = cost.reshape(guess.size, 2, usable.shape[1] // 2)
     minimum = (cost <= np.roll(cost, 1, axis=2)) & (cost <= np.roll(cost, -1, axis=2))
-    low = np.where(minimum, cost, np.inf).reshape(guess.size, 2 * directions)
+    low = np.where(minimum, cost, np.inf).reshape(guess.size, usable.shape[1])
     number = STARTS_PER_COMBINATION * effort
-    at = np.argpartition(low, number, axis=1)[:, :number]
-    which, nth = np.nonzero(np.isfinite(np.take_along_axis(low, at, axis=1)))
-    new = begin(which, at[which, nth])
+    nth = np.argpartition(low, number, axis=1)[:, :number]
+    which, rank = np.nonzero(np.isfinite(np.take_along_axis(low, nth, axis=1)))
+    ends = postures(which, nth[which, rank])
+    free = np.array([False, True])
     for rounds, some, kept in ((4, coarse, starts * effort), (8, half, KEPT_GUESSES * effort)):
-        new, cost = _newton(old[which], new, part[which, some], data[which, some], links, rounds)
-        order = np.lexsort((cost, guess[which]))
+        ends, costs, _ = _fitted(
+            plane, ends, part[which][:, :, some], data[which][:, :, some], free, rounds
+        )
+        order = np.lexsort((costs[:, 0], guess[which]))
         owner = guess[which][order]
         order = order[np.arange(owner.size) - np.searchsorted(owner, owner) < kept]
-        which, new, cost = which[order], new[order], cost[order]
-    more = guesses.keep(guess[which])
-    more.found.postures[:, move + 1] = new
-    more.found.lengths[:, move] = COMBINATIONS[combination[which]]
-    more.found.cost[:, move] = _misfit(old[which], new, part[which], data[which], links)[1]
-    return more
+        which, ends = which[order], ends[order]
+    # Several starts lead to the same end.
+    same = np.concatenate([which[:, None], np.rint(ends[:, 1] / 2)], axis=1)
+    _, index = np.unique(same, axis=0, return_index=True)
+    which, ends = which[index], ends[index]
+    cost = _costs(_errors(plane, ends, part[which], data[which]))
+    return guesses.extend(guess[which], move, ends[:, 1], lengths[which], cost[:, 0])
 
 
-def _starts(plane: Plane) -> tuple[NDArray, NDArray]:
-    """Postures (n, 3) of the first rest, and which (n,) of them are on the grid."""
-    rest, posture = grid_postures(plane.rests[:, :1], plane.tolerance, plane.links)
-    count = plane.tolerance.size
-    begin = np.searchsorted(rest, np.arange(count))
-    on_grid = np.bincount(rest, minlength=count) > 0
-    found = np.zeros((count, 3))
-    found[on_grid] = posture[begin[on_grid]]
-    scan, feasible = _curve(plane.rests[:, 0], plane.links)
+def _starts(plane: Plane, paths: NDArray) -> tuple[Explanations, NDArray]:
+    """Postures of the first rest of paths, and which paths (n,) have it on the grid."""
+    owner, posture = grid_postures(plane, paths, 0)
+    on_grid = np.isin(np.arange(len(plane.noise)), owner)
+    scan, feasible = _curve(plane, paths, 0, DIRECTIONS)
     size = np.where(feasible, np.abs(scan).max(axis=2), np.inf)
-    nearest = scan[np.arange(count), np.argmin(size, axis=1)]
-    usable = ~on_grid & feasible.any(axis=1)
-    found[usable] = nearest[usable]
-    return on_grid, found
+    first = scan[np.arange(paths.size), np.argmin(size, axis=1)]
+    first[~feasible.any(axis=1)] = 0.0
+    _, nearest = np.unique(owner, return_index=True)
+    first[on_grid[paths]] = posture[nearest]
+    return Explanations.of(paths, first, plane.noise.shape[1]), on_grid
 
 
-def _curve(
-    rest: NDArray, links: tuple[float, ...], directions: int = DIRECTIONS
-) -> tuple[NDArray, NDArray]:
+def _curve(plane: Plane, paths: NDArray, rest: int, directions: int) -> tuple[NDArray, NDArray]:
     """Postures (p, 2 * directions, 3) on the curve that attains each point, and usability."""
-    radius, height = rest.T
+    points = plane.rests[paths, rest]
     tip = np.arange(directions) * (TURN / directions)
     # A small tolerance includes the outstretched arm.
-    low, high = bends(radius, height, tip, np.full(radius.size, 1e-3), links)
-    usable = low <= high
-    bend = np.where(usable, (low + high) / 2, 0.0)
-    ways = [with_tip(radius[:, None], height[:, None], tip, way, links) for way in (bend, -bend)]
+    low, high = bends(points, tip, np.full(paths.size, 1e-3), plane.arm)
+    usable = np.tile(low <= high, 2)
+    bend = np.where(low <= high, (low + high) / 2, 0.0)
+    ways = [attain(points[:, None], tip, way, plane.arm) for way in (bend, -bend)]
     posture = np.concatenate(ways, axis=1)
-    usable = np.tile(usable, 2) & (np.abs(posture) <= LIMIT).all(axis=2)
-    return posture, usable
+    return posture, usable & (np.abs(posture) <= LIMIT).all(axis=2)
 
 
-def _jacobian(angle: NDArray, links: tuple[float, ...]) -> NDArray:
-    """Derivatives (..., 2, 3) of radius and height in m per step of postures (..., 3)."""
-    one, two, three = links
-    first = angle[..., 0] * STEP
-    second = first + angle[..., 1] * STEP
-    third = second + angle[..., 2] * STEP
-    slope = np.empty((*angle.shape[:-1], 2, 3))
-    # A joint rotates every link behind it: sums from the tip inwards.
-    slope[..., 0, 2] = STEP * three * np.cos(third)
-    slope[..., 0, 1] = STEP * two * np.cos(second) + slope[..., 0, 2]
-    slope[..., 0, 0] = STEP * one * np.cos(first) + slope[..., 0, 1]
-    slope[..., 1, 2] = -STEP * three * np.sin(third)
-    slope[..., 1, 1] = -STEP * two * np.sin(second) + slope[..., 1, 2]
-    slope[..., 1, 0] = -STEP * one * np.sin(first) + slope[..., 1, 1]
-    return slope
-
-
-def _misfit(
-    old: NDArray, new: NDArray, part: NDArray, data: NDArray, links: tuple[float, ...]
+def _movements(
+    plane: Plane, paths: NDArray, moves: slice, lengths: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Errors (p, k, 2) in m, and their mean square, of steps (p, 3) with parts done (p, k, 3)."""
-    error = np.stack(forward(old[:, None] + (new - old)[:, None] * part, links), axis=-1) - data
-    return error, (error**2).sum(axis=-1).mean(axis=-1)
+    """Finished fractions (p, m, K, 3) of ramps (p, m, 3), and samples (p, m, K, 2)."""
+    parts = np.take_along_axis(plane.parts[paths, moves], lengths[..., None], axis=2)
+    return parts.swapaxes(2, 3), plane.data[paths, moves]
 
 
-def _newton(
-    old: NDArray, new: NDArray, part: NDArray, data: NDArray, links: tuple[float, ...],
-    rounds: int,
-) -> tuple[NDArray, NDArray]:  # fmt: skip
-    """Damped Gauss-Newton on the posture (p, 3) at the end of a movement; mean square errors."""
-    error, cost = _misfit(old, new, part, data, links)
-    damping = np.full(cost.size, 1e-4)
-    width = 2 * part.shape[1]
-    for _ in range(rounds):
-        slope = _jacobian(old[:, None] + (new - old)[:, None] * part, links) * part[:, :, None]
-        step = _damped(slope.reshape(cost.size, width, 3), error.reshape(cost.size, width), damping)
-        trial = np.clip(new - step, -LIMIT, LIMIT)
-        trial_error, trial_cost = _misfit(old, trial, part, data, links)
-        better = trial_cost < cost
-        new = np.where(better[:, None], trial, new)
-        error = np.where(better[:, None, None], trial_error, error)
-        cost = np.where(better, trial_cost, cost)
-        damping = np.where(better, damping / 10, damping * 10)
-    return new, cost
+def _angles(postures: NDArray, part: NDArray) -> NDArray:
+    """Angles (p, m, K, 3) in rad between postures (p, m + 1, 3)."""
+    return STEP * (postures[:, :-1, None] + np.diff(postures, axis=1)[:, :, None] * part)
 
 
-def _damped(slope: NDArray, error: NDArray, damping: NDArray) -> NDArray:
-    """Levenberg-Marquardt steps (p, 3) for slopes (p, k, 3) and errors (p, k)."""
-    transposed = slope.swapaxes(1, 2)
-    matrix = transposed @ slope
-    size = np.trace(matrix, axis1=1, axis2=2) + 1e-20
-    matrix = matrix + (size * (damping + 1e-13))[:, None, None] * np.eye(3)
-    return np.linalg.solve(matrix, transposed @ error[..., None])[..., 0]
+def _errors(plane: Plane, postures: NDArray, part: NDArray, data: NDArray) -> NDArray:
+    """Errors (p, m, K, 2) in m of movements between postures (p, m + 1, 3)."""
+    return plane.arm.in_plane(_angles(postures, part)) - data
 
 
-def _refine(plane: Plane, guesses: _Guesses, on_grid: NDArray, moves: int, rounds: int) -> None:
+def _costs(error: NDArray) -> NDArray:
+    """Mean square errors (p, m) of movements."""
+    return (error**2).sum(axis=3).mean(axis=2)
+
+
+def _fitted(
+    plane: Plane, postures: NDArray, part: NDArray, data: NDArray, free: NDArray, rounds: int
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Postures (p, m + 1, 3) where they are free, fitted together; their costs and Jacobian."""
+    count, moves, samples, _ = part.shape
+    free = np.broadcast_to(free, (count, moves + 1))[..., None]
+
+    def evaluate(x: NDArray) -> tuple[NDArray, NDArray]:
+        ends = x.reshape(postures.shape)
+        slope = STEP * plane.arm.jacobian_in_plane(_angles(ends, part))
+        whole = np.zeros((count, moves, samples, 2, moves + 1, 3))
+        for move in range(moves):
+            done = part[:, move, :, None]
+            whole[:, move, :, :, move] = slope[:, move] * (1 - done)
+            whole[:, move, :, :, move + 1] = slope[:, move] * done
+        whole *= free[:, None, None, None]
+        error = _errors(plane, ends, part, data)
+        rows = (count, moves * samples * 2)
+        return error.reshape(rows), whole.reshape(*rows, x.shape[1])
+
+    start = postures.reshape(count, 3 * (moves + 1))
+    x, _ = gauss_newton(evaluate, start, rounds=rounds, limit=LIMIT)
+    ends = x.reshape(postures.shape)
+    return ends, _costs(_errors(plane, ends, part, data)), evaluate(x)[1]
+
+
+def _refine(plane: Plane, guesses: Explanations, on_grid: NDArray, moves: int, rounds: int) -> None:
     """Fit all postures of the first movements together, ramps fixed, by Gauss-Newton.
 
     Movements whose target has a standard deviation above half a step are marked as tied.
     """
-    found, path = guesses.found, guesses.path
-    count = path.size
-    lengths = found.lengths[:, :moves, :, None]
-    part = np.take_along_axis(plane.parts[path, :moves], lengths, axis=2).swapaxes(2, 3)
-    data = np.stack([plane.radius[path, :moves], plane.height[path, :moves]], axis=-1)
-    width = 3 * moves + 3
-    diagonal = np.arange(width)
-    hold = np.zeros((count, width))
-    hold[on_grid[path], :3] = 1e6
-
-    def evaluate(postures: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        angle = postures[:, :-1, None] + np.diff(postures, axis=1)[:, :, None] * part
-        error = np.stack(forward(angle, plane.links), axis=-1) - data
-        return angle, error, (error**2).sum(axis=-1).mean(axis=-1)
-
-    new = found.postures[:, : moves + 1]
-    angle, error, cost = evaluate(new)
-    damping = np.full(count, 1e-6)
-    weights = np.stack([1 - part, part], axis=3)[:, :, :, None]
-    for _ in range(rounds):
-        slope = _jacobian(angle, plane.links)[:, :, :, :, None] * weights
-        slope = slope.reshape(count, moves, 2 * part.shape[2], 6)
-        transposed = slope.swapaxes(2, 3)
-        block = transposed @ slope
-        gradient = transposed @ error.reshape(count, moves, 2 * part.shape[2], 1)
-        matrix, vector = np.zeros((count, width, width)), np.zeros((count, width))
-        for move in range(moves):
-            at = slice(3 * move, 3 * move + 6)
-            matrix[:, at, at] += block[:, move]
-            vector[:, at] += gradient[:, move, :, 0]
-        matrix[:, diagonal, diagonal] += hold + 1e-16
-        normal = matrix.copy()
-        normal[:, diagonal, diagonal] *= 1 + damping[:, None]
-        trial = new - np.linalg.solve(normal, vector[..., None]).reshape(new.shape)
-        trial_angle, trial_error, trial_cost = evaluate(trial)
-        better = trial_cost.sum(axis=1) < cost.sum(axis=1)
-        new = np.where(better[:, None, None], trial, new)
-        angle[better], error[better] = trial_angle[better], trial_error[better]
-        cost[better] = trial_cost[better]
-        damping = np.where(better, damping / 100, damping * 10)
-    found.postures[:, : moves + 1], found.cost[:, :moves] = new, cost
-    variance = np.abs(np.einsum("nii->ni", np.linalg.inv(matrix))).reshape(new.shape)
+    path, first = guesses.path, slice(0, moves)
+    part, data = _movements(plane, path, first, guesses.lengths[:, :moves])
+    free = np.ones((path.size, moves + 1), dtype=bool)
+    free[:, 0] = ~on_grid[path]
+    ends, cost, slope = _fitted(plane, guesses.postures[:, : moves + 1], part, data, free, rounds)
+    guesses.postures[:, : moves + 1], guesses.cost[:, :moves] = ends, cost
+    matrix = slope.swapaxes(1, 2) @ slope + 1e-16 * np.eye(slope.shape[2])
+    variance = np.abs(np.einsum("nii->ni", np.linalg.inv(matrix))).reshape(ends.shape)
     uncertain = (variance[:, 1:] * (cost + FLOOR)[..., None]).max(axis=2) > 0.5**2
-    found.tied[:, :moves] = uncertain
+    guesses.tied[:, :moves] = uncertain
