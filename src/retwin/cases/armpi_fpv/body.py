@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.cases.armpi_fpv.closed_form import KinematicTwin
+from retwin.cases.armpi_fpv.gauss_newton import gauss_newton
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
@@ -149,27 +150,14 @@ def _descend(
     arm: YawPitchArm, start: NDArray, commanded: NDArray, tip: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Poses (..., joints) and their cost (...) by damped Gauss-Newton from `start`."""
+    stay = np.broadcast_to(COMMAND_WEIGHT * np.eye(arm.joints), (*start.shape, arm.joints))
 
-    def cost_of(pose: NDArray) -> NDArray:
-        error, deviation = tip - arm.position(pose), COMMAND_WEIGHT * (commanded - pose)
-        return (error**2).sum(axis=-1) + (deviation**2).sum(axis=-1)
+    def evaluate(pose: NDArray) -> tuple[NDArray, NDArray]:
+        deviation = COMMAND_WEIGHT * (pose - commanded)
+        error = np.concatenate([arm.position(pose) - tip, deviation], axis=-1)
+        return error, np.concatenate([arm.jacobian(pose), stay], axis=-2)
 
-    pose, cost = start, cost_of(start)
-    damping = np.full(cost.shape, 1e-4)
-    eye = np.eye(start.shape[-1])
-    for _ in range(GAUSS_NEWTON_STEPS):
-        jacobian = arm.jacobian(pose)
-        transposed = np.swapaxes(jacobian, -1, -2)
-        gradient = transposed @ (tip - arm.position(pose))[..., None]
-        gradient += COMMAND_WEIGHT**2 * (commanded - pose)[..., None]
-        normal = transposed @ jacobian + (COMMAND_WEIGHT**2 + damping)[..., None, None] * eye
-        trial = pose + np.linalg.solve(normal, gradient)[..., 0]
-        new = cost_of(trial)
-        better = new < cost
-        pose = np.where(better[..., None], trial, pose)
-        cost = np.where(better, new, cost)
-        damping = np.where(better, damping / 10, damping * 10)
-    return pose, cost
+    return gauss_newton(evaluate, start, rounds=GAUSS_NEWTON_STEPS)
 
 
 def _interpolated(trajectories: Trajectories) -> NDArray:

@@ -90,7 +90,7 @@ class YawPitchArm:
             pitch joint, in m.
 
         """
-        pitch, links = np.cumsum(angles, axis=-1), np.asarray(self.links, dtype=angles.dtype)
+        pitch, links = self._pitch(angles)
         return np.stack([np.sin(pitch) @ links, np.cos(pitch) @ links], axis=-1)
 
     def jacobian_in_plane(self, angles: NDArray) -> NDArray:
@@ -107,7 +107,13 @@ class YawPitchArm:
             Derivatives in m/rad.
 
         """
-        pitch, links = np.cumsum(angles, axis=-1), np.asarray(self.links, dtype=angles.dtype)
-        # A pitch joint rotates every link behind it: sums from the tip inwards.
+        pitch, links = self._pitch(angles)
         each = np.stack([np.cos(pitch) * links, -np.sin(pitch) * links], axis=-2)
-        return np.cumsum(each[..., ::-1], axis=-1)[..., ::-1]
+        # A pitch joint rotates every link behind it: sums from the tip inwards.
+        return each @ np.tri(len(links), dtype=angles.dtype)
+
+    def _pitch(self, angles: NDArray) -> tuple[NDArray, NDArray]:
+        """Pitch (..., links) of each link, and their lengths."""
+        links = np.asarray(self.links, dtype=angles.dtype)
+        # A product with ones is faster than a sum along a short axis.
+        return angles @ np.tri(len(links), dtype=angles.dtype).T, links

@@ -212,7 +212,7 @@ class PathFit:
         )
         found = grid_chain(plane, rows)
         # A single rest may be near the grid by coincidence, all rests of a path are not.
-        found = found.rows((found.cost < EXPLAINED**2).all(axis=1))
+        found = found.rows(np.flatnonzero((found.cost < EXPLAINED**2).all(axis=1)))
         self.whole[rows], self.whole[found.path] = False, True
         free = free_chain(plane, rows[~self.whole[rows]], effort)
         for each in (found, free):
@@ -272,7 +272,9 @@ class PathFit:
         units = STRAIGHT - self.steps
         # A closed ramp of L samples lasts L - 1 intervals.
         spans = self.ramps - self.closed[:, None, None]
-        return ramps_and_holds(units[:, 0], units[:, 1:], spans, onsets, self.length)
+        made = ramps_and_holds(units[:, 0], units[:, 1:], spans, onsets, self.length)
+        # A sum of ramps may exceed the range by rounding.
+        return made.clip(STRAIGHT - LIMIT, STRAIGHT + LIMIT)
 
     def _error(self, onsets: NDArray) -> NDArray:
         """Error (n, T, 3) in m of the forward kinematics."""

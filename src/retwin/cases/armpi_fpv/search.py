@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from retwin.cases.armpi_fpv.gauss_newton import gauss_newton
 from retwin.cases.armpi_fpv.plane import LIMIT, STEP, TURN, Plane, attain, bends, grid_postures
@@ -80,7 +80,7 @@ class Explanations:
         return Explanations(*map(np.concatenate, pairs))
 
     def extend(
-        self, rows: NDArray, move: int, posture: NDArray, lengths: NDArray, cost: NDArray
+        self, rows: NDArray, move: int, posture: NDArray, lengths: ArrayLike, cost: ArrayLike
     ) -> Explanations:
         """Some explanations, with what comes after a movement."""
         more = self.rows(rows)
@@ -304,14 +304,15 @@ def _fitted(
 
     def evaluate(x: NDArray) -> tuple[NDArray, NDArray]:
         ends = x.reshape(postures.shape)
-        slope = STEP * plane.arm.jacobian_in_plane(_angles(ends, part))
+        slope = plane.arm.jacobian_in_plane(_angles(ends, part))
+        # The first joint rotates the whole arm: its column holds height and radius.
+        error = np.stack([-slope[..., 1, 0], slope[..., 0, 0]], axis=-1) - data
         whole = np.zeros((count, moves, samples, 2, moves + 1, 3))
         for move in range(moves):
             done = part[:, move, :, None]
             whole[:, move, :, :, move] = slope[:, move] * (1 - done)
             whole[:, move, :, :, move + 1] = slope[:, move] * done
-        whole *= free[:, None, None, None]
-        error = _errors(plane, ends, part, data)
+        whole *= STEP * free[:, None, None, None]
         rows = (count, moves * samples * 2)
         return error.reshape(rows), whole.reshape(*rows, x.shape[1])
 
