@@ -17,7 +17,7 @@ from retwin.cases.animation.film import check_film, write_film
 from retwin.cases.animation.page import Chart, film_pages, picture_size
 from retwin.cases.animation.shots import Pictures, Shots
 from retwin.cases.animation.solid import mujoco_pictures
-from retwin.checks import agree, finite, one_of, require
+from retwin.checks import agree, finite, given, one_of, require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress, tracked
@@ -98,14 +98,18 @@ def animate(
     """
     _check(fps, size, renderer, least=SMALL if updated is None else WITH_CHART)
     suffix = check_film(path)
-    body = _body_of(case)
+    remedy, got = "give the Case a body", f"{case.name}, which has none"
+    body = given(
+        "case", case.body, "a case with a body, which can be drawn", got=got, remedy=remedy
+    )
     one = _chosen(trajectories, case, index)
     one = case.complete(one)
     shots, chart = _shots(one, body, fps), None
     if updated is not None:
         drawn = _draws(updated, one, seed)
-        shots = replace(shots, drawn=_tips(body, one, drawn[:SHOWN], fps))
-        chart = _chart(one, drawn)
+        _, poses = body.poses(drawn[:SHOWN])
+        shots = replace(shots, drawn=body.skeleton(poses[:, _samples(one, fps)])[..., -1, :])
+        chart = _chart(one, drawn.observed)
     target, inner = Path(path), picture_size(size, chart=chart is not None)
     with write_atomically(target) as part, _pictures(shots, body, inner, renderer) as pictures:
         pages = tracked(film_pages(shots, size, pictures, chart), len(shots), progress)
@@ -113,8 +117,8 @@ def animate(
     return target
 
 
-def _draws(updated: Twin, one: Trajectories, seed: int) -> NDArray:
-    """Outputs (draws, T, d_y) of the updated twin for the commands of a trajectory."""
+def _draws(updated: Twin, one: Trajectories, seed: int) -> Trajectories:
+    """Draws of the updated twin for the commands of a trajectory."""
     remedy = "give the corrected twin that was fitted for these data"
     agree("updated", updated, one, "that of the trajectory", remedy=remedy)
     made = updated.simulate(np.repeat(one.commands, DRAWS, axis=0), seed=seed)
@@ -125,22 +129,7 @@ def _draws(updated: Twin, one: Trajectories, seed: int) -> NDArray:
         got="outputs that are not",
         remedy="fit it on commands like these",
     )
-    return made.observed
-
-
-def _tips(body: Body, one: Trajectories, drawn: NDArray, fps: float) -> NDArray:
-    """The positions (draws, frames, 3) of the tip that explain drawn outputs, in m."""
-    count = len(drawn)
-    several = Trajectories(
-        commands=np.repeat(one.commands, count, axis=0),
-        nominal=np.repeat(one.nominal, count, axis=0),
-        observed=drawn,
-        mask=np.ones(drawn.shape, dtype=bool),
-        rate=one.rate,
-        inputs=one.inputs,
-        outputs=one.outputs,
-    )
-    return body.skeleton(body.poses(several)[1][:, _samples(one, fps)])[..., -1, :]
+    return made
 
 
 def _chart(one: Trajectories, drawn: NDArray) -> Chart:
@@ -172,18 +161,6 @@ def _check(fps: float, size: tuple[int, int], renderer: str, *, least: tuple[int
         remedy="640x480 is common",
     )
     one_of("renderer", renderer, get_args(Renderer), remedy="leave it out to have one chosen")
-
-
-def _body_of(case: Case) -> Body:
-    """The body of the case, or an InputError."""
-    if case.body is None:
-        raise InputError(
-            "case",
-            expected="a case with a body, which can be drawn",
-            got=f"{case.name}, which has none",
-            remedy="give the Case a body",
-        )
-    return case.body
 
 
 def _chosen(trajectories: Trajectories, case: Case, index: int | str) -> Trajectories:

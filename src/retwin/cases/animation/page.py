@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, UPDATED, Pictures, Shots, rings
+from retwin.cases.animation.shots import (
+    GHOST,
+    PAPER,
+    RING,
+    SOLID,
+    UPDATED,
+    Camera,
+    Pictures,
+    Shots,
+)
 
 DPI = 100
 """Pixels per inch, by which matplotlib converts sizes."""
@@ -64,7 +74,7 @@ def film_pages(
         The frames.
     size : (int, int)
         Width and height in pixels.
-    pictures : iterable of ndarray of uint8, shape (height, width, 3), optional
+    pictures : iterable of ndarray of uint8, shape (height, width, 4), optional
         The pictures, as large as `picture_size` states; by default stick figures are drawn.
     chart : Chart, optional
         The chart beside or below them, of which time uncovers more and more.
@@ -85,20 +95,12 @@ def film_pages(
     inner = picture_size(size, chart=chart is not None)
     box = (0.0, 1 - inner[1] / height, inner[0] / width, inner[1] / height)
     text = max(9.0, min(inner[0] / 44, inner[1] / 31))
-    steps: list[Callable[[int], None]] = []
-    frames: Iterator[Any] = iter(pictures if pictures is not None else range(len(shots)))
-    image = None
-    if pictures is None:
-        steps.append(_sticks(figure, box, shots, min(inner) / 480))
-    else:
-        blank = np.zeros((inner[1], inner[0], 3), np.uint8)
-        image = figure.figimage(blank, 0, height - inner[1], origin="upper")
-    steps.append(_captions(figure, box, shots, text, size))
+    scene = _draw_scene(figure, box, shots, inner, pictures is not None)
+    steps = [_captions(figure, box, shots, text, size)]
     if chart is not None:
         steps.append(_draw_chart(figure, chart, shots, size, inner))
-    for i, picture in enumerate(frames):
-        if image is not None:
-            image.set_data(picture)
+    for i, picture in enumerate(repeat(None, len(shots)) if pictures is None else pictures):
+        scene(i, picture)
         for step in steps:
             step(i)
         canvas.draw()
@@ -132,46 +134,50 @@ def _captions(
     return lambda frame: time.set_text(f"{shots.seconds[frame]:.2f} s")
 
 
-def _sticks(
-    figure: Any, box: tuple[float, ...], shots: Shots, unit: float
-) -> Callable[[int], None]:
-    """Draw the two skeletons, the paths of their tips, and the draws of an updated twin."""
-    axes = figure.add_axes(box, projection="3d", facecolor=PAPER, computed_zorder=False)
-    root, reach = shots.root, shots.reach
-    axes.set(
-        xlim=(root[0] - reach, root[0] + reach),
-        ylim=(root[1] - reach, root[1] + reach),
-        zlim=(root[2], root[2] + reach),
-    )
-    axes.set_box_aspect((2, 2, 1), zoom=1.5)
-    axes.view_init(elev=18, azim=-50)
+def _draw_scene(
+    figure: Any, box: tuple[float, ...], shots: Shots, size: tuple[int, int], solid: bool
+) -> Callable[[int, NDArray | None], None]:
+    """Draw bodies or skeletons, the paths of their tips, and the draws of an updated twin."""
+    width, height = size
+    unit, camera = min(size) / 480, Camera.of(shots, size)
+    axes = figure.add_axes(box, xlim=(0, width), ylim=(height, 0))
     axes.set_axis_off()
 
-    def line(colour: Any, width: float, zorder: int, **look: Any) -> Any:
-        return axes.plot([], [], [], color=colour, linewidth=width * unit, zorder=zorder, **look)[0]
+    def line(colour: Any, thick: float, zorder: int, **look: Any) -> Any:
+        return axes.plot([], [], color=colour, linewidth=thick * unit, zorder=zorder, **look)[0]
 
-    for ring in rings(root, reach):
-        line(RING, 1 / unit, 1, clip_on=False).set_data_3d(*ring.T)
+    def show(one: Any, points: NDArray) -> None:
+        one.set_data(*camera.project(points).T)
+
+    for ring in shots.rings:
+        show(line(RING, 1 / unit, 1), ring)
+    blank = np.zeros((height, width, 4), np.uint8)
+    image = axes.imshow(blank, extent=(0, width, height, 0), aspect="auto", zorder=2)
     chains = [
-        (points, line(colour, 1.2, zorder), line(colour, thick, zorder + 2, alpha=alpha))
+        (
+            points,
+            line(colour, 1.2, zorder, marker="o", markersize=5 * unit, markevery=[-1]),
+            line(colour, thick, zorder + 2, alpha=alpha, marker="o", markersize=1.7 * thick * unit),
+        )
         for points, colour, alpha, thick, zorder in (
-            (shots.nominal_points, GHOST, 0.55, 5.0, 2),
-            (shots.observed_points, SOLID, 1.0, 4.0, 3),
+            (shots.nominal_points, GHOST, 0.55, 5.0, 3),
+            (shots.observed_points, SOLID, 1.0, 4.0, 4),
         )
     ]
-    for _, _, chain in chains:
-        chain.set(marker="o", markersize=1.7 * chain.get_linewidth(), solid_capstyle="round")
-    trails = [line(UPDATED, 0.8, 3, alpha=0.6) for _ in shots.drawn]
-    tips = line(UPDATED, 0, 6, marker="o", markersize=3.5 * unit)
+    trails = [line(UPDATED, 0.8, 4, alpha=0.6) for _ in shots.drawn]
+    tips = line(UPDATED, 0, 7, marker="o", markersize=3.5 * unit)
 
-    def step(frame: int) -> None:
+    def step(frame: int, picture: NDArray | None) -> None:
         for trail, path in zip(trails, shots.trails(frame), strict=True):
-            trail.set_data_3d(*path.T)
+            show(trail, path)
         if trails:
-            tips.set_data_3d(*shots.drawn[:, frame].T)
+            show(tips, shots.drawn[:, frame])
         for points, trace, chain in chains:
-            trace.set_data_3d(*points[: frame + 1, -1].T)
-            chain.set_data_3d(*points[frame].T)
+            show(trace, points[: frame + 1, -1])
+            if not solid:
+                show(chain, points[frame])
+        if picture is not None:
+            image.set_data(picture)
 
     return step
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Pictures = Iterable[NDArray]
-"""Pictures (height, width, 3) of uint8."""
+"""Pictures (height, width, 4) of uint8, transparent where nothing is."""
 
 GHOST = (0.47, 0.53, 0.60)
 SOLID = (0.00, 0.41, 0.66)
@@ -70,23 +70,50 @@ class Shots:
         links = np.diff(self.nominal_points, axis=1)
         return float(np.linalg.norm(links, axis=2).sum(axis=1).max())
 
+    @property
+    def rings(self) -> list[NDArray]:
+        """Circles (points, 3) in m on the floor around the root, at thirds of the reach."""
+        angle = np.linspace(0, 2 * np.pi, 61)
+        circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+        return [self.root + fraction * self.reach * circle for fraction in (1 / 3, 2 / 3, 1)]
 
-def rings(root: NDArray, reach: float) -> list[NDArray]:
-    """Circles on the floor around the root, at thirds of the reach.
 
-    Parameters
+@dataclass(frozen=True)
+class Camera:
+    """A perspective camera that sees all that the tip can reach; MuJoCo's has the same parameters.
+
+    Attributes
     ----------
-    root : ndarray, shape (3,)
-        Base of the chain in m.
-    reach : float
-        Largest distance from root to tip in m.
-
-    Returns
-    -------
-    list of ndarray, shape (points, 3)
-        Three closed polygons in m.
+    lookat : tuple of float
+        Point (3,) in m in the middle of the picture.
+    distance : float
+        Distance of the camera from it in m.
+    size : (int, int)
+        Width and height of the picture in pixels.
+    azimuth, elevation, field : float
+        Direction of view, and vertical field of view, in degrees.
 
     """
-    angle = np.linspace(0, 2 * np.pi, 61)
-    circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    return [root + fraction * reach * circle for fraction in (1 / 3, 2 / 3, 1)]
+
+    lookat: tuple[float, ...]
+    distance: float
+    size: tuple[int, int]
+    azimuth: float = 130.0
+    elevation: float = -18.0
+    field: float = 45.0
+
+    @classmethod
+    def of(cls, shots: Shots, size: tuple[int, int]) -> Camera:
+        """The camera of a film."""
+        middle = np.add(shots.root, (0, 0, 0.38 * shots.reach)).tolist()
+        return cls(tuple(middle), 2.75 * shots.reach * max(1.0, 4 / 3 * size[1] / size[0]), size)
+
+    def project(self, points: NDArray) -> NDArray:
+        """Pixels (..., 2), from the upper left corner, of points (..., 3) in m."""
+        across, up = np.deg2rad((self.azimuth, self.elevation))
+        view = np.array([np.cos(up) * np.cos(across), np.cos(up) * np.sin(across), np.sin(up)])
+        right = np.array([np.sin(across), -np.cos(across), 0])
+        seen = (points - self.lookat) @ np.stack([right, -np.cross(right, view), view], axis=1)
+        width, height = self.size
+        scale = height / 2 / np.tan(np.deg2rad(self.field / 2))
+        return (width / 2, height / 2) + scale * seen[..., :2] / (self.distance + seen[..., 2:])

@@ -9,27 +9,17 @@ from __future__ import annotations
 import importlib.util
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pebble import ProcessExpired, ProcessPool
 
-from retwin.cases.animation.shots import (
-    GHOST,
-    PAPER,
-    RING,
-    SOLID,
-    UPDATED,
-    Pictures,
-    Shots,
-    rings,
-)
+from retwin.cases.animation.shots import GHOST, PAPER, Camera, Pictures, Shots
 from retwin.checks import require
 from retwin.errors import InputError, brief
 from retwin.workers.pools import worker_pool
@@ -66,7 +56,7 @@ def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator
 
     Yields
     ------
-    iterable of ndarray of uint8, shape (height, width, 3)
+    iterable of ndarray of uint8, shape (height, width, 4)
         One picture per frame.
 
     Raises
@@ -89,7 +79,7 @@ def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator
         got="an installation without it",
         remedy='install it: pip install "retwin[render]"',
     )
-    stage = _Stage(str(body.model), body.joints, tuple(shots.root.tolist()), shots.reach, size)
+    stage = _Stage(str(body.model), body.joints, Camera.of(shots, size))
     named = os.environ.get("MUJOCO_GL", "").lower()
     reasons = []
     for backend in (named,) if named else BACKENDS:
@@ -116,23 +106,19 @@ def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator
 
 @dataclass(frozen=True)
 class _Stage:
-    """Settings of a scene: the MJCF file, joints, base of the chain in m, reach in m, and size."""
+    """Settings of a scene: the MJCF file, the joints, and the camera."""
 
     model: str
     joints: tuple[str, ...]
-    root: tuple[float, ...]
-    reach: float
-    size: tuple[int, int]
+    camera: Camera
 
 
 def _pictures(pool: ProcessPool, stage: _Stage, shots: Shots) -> Iterator[NDArray]:
-    """The pictures, some frames at a time, each with the traces that lead to it."""
+    """The pictures, some frames at a time."""
+    poses = np.stack([shots.nominal, shots.observed], axis=1)
     for first in range(0, len(shots), FRAMES_PER_TASK):
-        end = min(first + FRAMES_PER_TASK, len(shots))
-        joints = np.stack([shots.nominal[first:end], shots.observed[first:end]])
-        tips = np.stack([shots.nominal_points[:end, -1], shots.observed_points[:end, -1]])
-        trails = [shots.trails(frame) for frame in range(first, end)]
-        yield from pool.schedule(_draw, (stage, joints, tips, trails), timeout=TIMEOUT).result()
+        some = poses[first : first + FRAMES_PER_TASK]
+        yield from pool.schedule(_draw, (stage, some), timeout=TIMEOUT).result()
 
 
 def _draw_with(backend: str) -> None:
@@ -143,21 +129,15 @@ def _draw_with(backend: str) -> None:
     os.environ.pop("PYOPENGL_PLATFORM", None)
 
 
-def _draw(stage: _Stage, joints: NDArray, tips: NDArray, trails: Sequence[NDArray]) -> NDArray:
-    """Pictures (frames, height, width, 3) for joints (2, frames, joints), nominal and observed.
+def _draw(stage: _Stage, poses: NDArray) -> NDArray:
+    """Pictures (frames, height, width, 4) of poses (frames, 2, joints), nominal and observed.
 
-    Runs in the worker. `tips` (2, all frames so far, 3) and the `trails` (draws, points, 3) of each
-    frame are in m. Failures are raised as RuntimeError, because OpenGL's errors cannot be sent to
-    another process.
+    Runs in the worker. Failures are raised as RuntimeError, because OpenGL's errors cannot be sent
+    to another process.
     """
     try:
-        scene, before = _scene(stage), tips.shape[1] - joints.shape[1]
-        return np.stack(
-            [
-                scene.picture(joints[:, i], tips[:, : before + i + 1], trails[i])
-                for i in range(joints.shape[1])
-            ]
-        )
+        scene = _scene(stage)
+        return np.stack([scene.picture(*pose) for pose in poses])
     except InputError:
         raise
     except Exception as error:
@@ -176,7 +156,7 @@ class _Scene:
     def __init__(self, stage: _Stage) -> None:
         import mujoco
 
-        self._mujoco, self._stage = mujoco, stage
+        self._mujoco = mujoco
         try:
             self._model = _compiled(stage)
             self._addresses = [self._model.joint(name).qposadr[0] for name in stage.joints]
@@ -188,86 +168,37 @@ class _Scene:
                 remedy="make the body's model and its joints agree",
             ) from None
         self._data = mujoco.MjData(self._model)
-        width, height = stage.size
-        self._renderer = mujoco.Renderer(self._model, height, width)
+        camera = stage.camera
+        self._renderer = mujoco.Renderer(self._model, camera.size[1], camera.size[0])
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0
         self._camera = mujoco.MjvCamera()
-        self._camera.lookat = np.add(stage.root, (0, 0, 0.38 * stage.reach))
-        self._camera.distance = 2.75 * stage.reach * max(1.0, 4 / 3 * height / width)
-        self._camera.azimuth, self._camera.elevation = 130, -18
+        self._camera.lookat, self._camera.distance = camera.lookat, camera.distance
+        self._camera.azimuth, self._camera.elevation = camera.azimuth, camera.elevation
         own = self._model.geom_group == BODY
         self._solid = self._model.geom_rgba.copy(), self._model.geom_matid.copy()
         self._ghost = self._solid[0].copy(), np.where(own, -1, self._solid[1])
         self._ghost[0][own, :3] = GHOST
-        mujoco.mj_forward(self._model, self._data)
-        self._background = self._rendered()
+        mujoco.mj_forward(self._model, self._data)  # places the lights
 
-    def picture(self, joints: NDArray, tips: NDArray, trails: NDArray) -> NDArray:
-        """The picture (height, width, 3) of nominal and observed joints (2, joints) in rad or m.
-
-        `tips` (2, points, 3) are traces of the nominal and the observed tip in m, and `trails`
-        (draws, points, 3) those of an updated twin, each of which ends in a ball.
-        """
-        nominal, observed = joints
-        solid = self._rendered(observed, self._solid, tuple(tips), trails)
+    def picture(self, nominal: NDArray, observed: NDArray) -> NDArray:
+        """The picture (height, width, 4) of nominal and observed joints in rad or m."""
         # The ghost is behind the solid body: two surfaces in one place would flicker.
-        ghost = self._rendered(nominal, self._ghost)
-        free = (solid == self._background).all(axis=2)
-        seen = (ghost != self._background).any(axis=2) & free
-        background = self._background[seen]
-        solid[seen] = (1 - GHOST_OPACITY) * background + GHOST_OPACITY * ghost[seen]
-        return solid
+        ghost, solid = self._rendered(nominal, self._ghost), self._rendered(observed, self._solid)
+        paper = np.round(255 * np.array(PAPER))
+        behind, there = (np.abs(each - paper).max(axis=2) > 2 for each in (ghost, solid))
+        opacity = np.where(there, 1, GHOST_OPACITY * behind)
+        colour = np.where(there[..., None], solid, ghost)
+        return np.concatenate([colour, 255 * opacity[..., None]], axis=2).astype(np.uint8)
 
-    def _rendered(
-        self,
-        joints: NDArray | None = None,
-        look: tuple[NDArray, NDArray] | None = None,
-        tips: Sequence[NDArray] = (),
-        trails: Sequence[NDArray] | NDArray = (),
-    ) -> NDArray:
-        """The picture of the floor, the body in a pose, and traces."""
-        self._option.geomgroup[BODY] = joints is not None
-        if joints is not None and look is not None:
-            self._data.qpos[self._addresses] = joints
-            self._model.geom_rgba[:], self._model.geom_matid[:] = look
-            self._mujoco.mj_kinematics(self._model, self._data)
+    def _rendered(self, joints: NDArray, look: tuple[NDArray, NDArray]) -> NDArray:
+        """The picture (height, width, 3) of the body in a pose."""
+        self._data.qpos[self._addresses] = joints
+        self._model.geom_rgba[:], self._model.geom_matid[:] = look
+        self._mujoco.mj_kinematics(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera, self._option)
         self._renderer.scene.flags[self._mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        for ring in rings(np.array(self._stage.root), self._stage.reach):
-            self._line(ring, RING, 1.5)
-        for trace, colour in zip(tips, (GHOST, SOLID), strict=False):
-            self._line(trace, colour, 3.0, ball=0.018)
-        for trail in trails:
-            self._line(trail, UPDATED, 1.0, ball=0.010)
         return self._renderer.render()
-
-    def _line(
-        self, points: NDArray, colour: Sequence[float], width: float, ball: float = 0.0
-    ) -> None:
-        """Draw a line that may end in a ball.
-
-        `width` is in pixels of a picture 480 high, the ball's radius a share of the reach.
-        """
-        scene, kinds = self._renderer.scene, self._mujoco.mjtGeom
-        # A scene holds few objects: of long traces only every second or third point is drawn.
-        kept = points[:: 1 + len(points) // (scene.maxgeom // 4)]
-        for begin, end in pairwise(kept):
-            geom = self._added(kinds.mjGEOM_LINE, colour, np.zeros(3), np.zeros(3))
-            pixels = width * min(self._stage.size) / 480
-            self._mujoco.mjv_connector(geom, kinds.mjGEOM_LINE, pixels, begin, end)
-        if ball:
-            size = np.full(3, ball * self._stage.reach)
-            self._added(kinds.mjGEOM_SPHERE, colour, size, points[-1])
-
-    def _added(self, kind: Any, colour: Sequence[float], size: NDArray, place: NDArray) -> Any:
-        """A new object in the scene."""
-        scene = self._renderer.scene
-        geom = scene.geoms[scene.ngeom]
-        paint = np.array([*colour, 1], np.float32)
-        self._mujoco.mjv_initGeom(geom, kind, size, place, np.eye(3).ravel(), paint)
-        scene.ngeom += 1
-        return geom
 
 
 def _compiled(stage: _Stage) -> Any:
@@ -280,7 +211,8 @@ def _compiled(stage: _Stage) -> Any:
         moves = geom.parent != spec.worldbody
         geom.group = (BODY if geom.group <= 2 else HIDDEN) if moves else FLOOR
     visual = spec.visual
-    visual.global_.offwidth, visual.global_.offheight = stage.size
+    visual.global_.offwidth, visual.global_.offheight = stage.camera.size
+    visual.global_.fovy = stage.camera.field
     visual.headlight.ambient, visual.headlight.diffuse = [0.5] * 3, [0.4] * 3
     visual.headlight.specular = [0.1] * 3
     spec.worldbody.add_light(pos=[0.4, -0.6, 1.5], dir=[-0.25, 0.35, -1], diffuse=[0.35] * 3)
