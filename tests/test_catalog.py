@@ -34,6 +34,7 @@ from retwin.catalog import (
 from retwin.data.io import load, save
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import fit_diagnoser, load_diagnoser
+from retwin.diagnosis.diagnoser import TrainingTask
 from retwin.errors import InputError
 from retwin.nets.networks import Network
 from retwin.serialisation.configs import from_config, to_config
@@ -112,8 +113,8 @@ class Frequencies:
 
     adapts: ClassVar[bool] = False
 
-    def fit(self, trajectories: Trajectories, target: None, **_: Any) -> Prior:
-        classes, counts = np.unique(trajectories.labels, return_counts=True)
+    def fit(self, task: TrainingTask) -> Prior:
+        classes, counts = np.unique(task.trajectories.labels, return_counts=True)
         return Prior(tuple(classes.tolist()), tuple((counts / counts.sum()).tolist()))
 
 

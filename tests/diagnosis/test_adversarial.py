@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import retwin as rt
-from retwin.diagnosis.adversarial import _Pair, _Reversed
+from retwin.diagnosis.adversarial import _Pair, _reverse
 from retwin.diagnosis.features import Features
 from retwin.nets.training import Training
 from retwin.testing import check_diagnoser
@@ -96,7 +96,7 @@ def test_labels_of_the_target_have_no_effect(
 
 def test_a_reversed_gradient() -> None:
     values = torch.tensor([1.0, -2.0], requires_grad=True)
-    passed = _Reversed.apply(values, 0.3)
+    passed = _reverse(values, 0.3)
     assert torch.equal(passed, values)
     (passed**2).sum().backward()
     torch.testing.assert_close(values.grad, torch.tensor([-0.6, 1.2]))

@@ -106,7 +106,7 @@ def test_bad_input_is_refused(base: rt.NetworkDiagnoser, generated: rt.Trajector
         rt.fit_diagnoser(generated, method, seed=0)
     with pytest.raises(rt.InputError, match="keeps those of its base"):
         rt.fit_diagnoser(generated, method, target=real, rate=5.0, seed=0)
-    with pytest.raises(rt.InputError, match="base: expected a NetworkDiagnoser, got CNN"):
+    with pytest.raises(rt.InputError, match="base: expected NetworkDiagnoser, got CNN"):
         rt.FineTune(SMALL)
     with pytest.raises(rt.InputError, match="generated_per_labelled: expected a whole number"):
         rt.FineTune(base, 0)

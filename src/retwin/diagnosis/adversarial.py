@@ -9,8 +9,8 @@ which the critic fails (Ganin et al., "Domain-adversarial training of neural net
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any, ClassVar
 
 import torch
@@ -18,12 +18,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from retwin.checks import positive, require, whole
-from retwin.data.trajectories import Trajectories
+from retwin.diagnosis.diagnoser import TrainingTask
 from retwin.diagnosis.features import Features, class_index, class_order, random_phase
 from retwin.diagnosis.network import NetworkDiagnoser, training_for
 from retwin.nets.networks import CNN, Network
-from retwin.nets.training import Training, isolated, train
-from retwin.progress import Progress
+from retwin.nets.training import isolated, train
 
 
 @dataclass(frozen=True)
@@ -56,17 +55,7 @@ class DANN:
         whole("hidden", self.hidden, least=1)
         positive("gamma", self.gamma)
 
-    def fit(
-        self,
-        source: Trajectories,
-        target: Trajectories | None,
-        *,
-        seed: int,
-        classes: Sequence[str] | None,
-        rate: float | None,
-        training: Training | None,
-        progress: Progress | None,
-    ) -> NetworkDiagnoser:
+    def fit(self, task: TrainingTask) -> NetworkDiagnoser:
         """Train the network and its critic; see `fit_diagnoser`.
 
         Each batch holds as many real trajectories as of the source, drawn with replacement. The
@@ -76,9 +65,10 @@ class DANN:
         figures hold the critic's `domain_accuracy` too, the mean of its accuracies on the held-out
         fifth and the target: 0.5 where the critic fails.
         """
+        source, target, seed = task.trajectories, task.target, task.seed
         assert target is not None, "checked by fit_diagnoser"
-        order = class_order(source, classes)
-        features = Features.at(source, rate, hide_start=True)
+        order = class_order(source, task.classes)
+        features = Features.at(source, task.rate, hide_start=True)
         require(
             len(target) > 0 and target.steps == source.steps,
             "target",
@@ -92,13 +82,32 @@ class DANN:
             pair = _Pair(diagnoser, self.hidden)
         phases, unlabelled = features.phases(fitted_on), features.phases(target)
         diagnoser.before.fit(phases)
-        how = training or training_for(self.network)
-        steps = how.max_epochs * math.ceil(len(phases) / how.batch_size)
-        loss = _Loss(unlabelled, torch.Generator().manual_seed(seed), self.gamma, steps)
+        how = task.training or training_for(self.network)
+        steps = count()
+        last = how.max_epochs * math.ceil(len(phases) / how.batch_size)
+        generator = torch.Generator().manual_seed(seed)
+
+        def loss(pair: _Pair, batch: tuple[Tensor, ...]) -> Tensor:
+            """Cross-entropy of the source's classes and of both domains."""
+            source = random_phase(batch[0], generator)
+            drawn = torch.randint(len(unlabelled), (len(source),), generator=generator)
+            real = random_phase(unlabelled[drawn], generator)
+            # In one pass: batch normalisation must not give either domain a scale of its own.
+            representation = pair.represent(torch.cat([source, real]))
+            # From 0 to 1 over the training: an untrained critic is wrong.
+            weight = 2 / (1 + math.exp(-self.gamma * next(steps) / last)) - 1
+            domains = torch.cat([torch.zeros(len(source)), torch.ones(len(real))])
+            return functional.cross_entropy(
+                pair.classify(representation[: len(source)]), batch[1]
+            ) + functional.binary_cross_entropy_with_logits(
+                pair.critic(_reverse(representation, weight))[:, 0], domains
+            )
+
         labelled = (phases, class_index(fitted_on, order))
-        result = train(pair, loss, labelled, None, how, seed=seed, progress=progress)
+        result = train(pair, loss, labelled, None, how, seed=seed, progress=task.progress)
+        best = diagnoser.of_features(features(held_out)).argmax(axis=1)
         figures = {
-            "accuracy": _accuracy(diagnoser, held_out),
+            "accuracy": float((best == class_index(held_out, order).numpy()).mean()),
             "domain_accuracy": pair.domain_accuracy(features(held_out), unlabelled[:, 0]),
         }
         diagnoser.fitted = replace(result, figures=figures)
@@ -138,50 +147,8 @@ class _Pair(nn.Module):
         return float(sum(each.float().mean() for each in hits) / 2)
 
 
-class _Reversed(torch.autograd.Function):
-    """The identity, whose gradient is negated and scaled (Ganin et al., section 4.2)."""
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, weight: float) -> Tensor:
-        ctx.weight = weight
-        return values.view_as(values)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        return -ctx.weight * gradients[0], None
-
-
-@dataclass
-class _Loss:
-    """Cross-entropy of the source's classes and of both domains; counts the training steps."""
-
-    target: Tensor
-    generator: torch.Generator
-    gamma: float
-    steps: int
-    done: int = 0
-
-    @property
-    def weight(self) -> float:
-        """The critic's weight, from 0 to 1 over the training: an untrained critic is wrong."""
-        return 2 / (1 + math.exp(-self.gamma * self.done / self.steps)) - 1
-
-    def __call__(self, pair: _Pair, batch: tuple[Tensor, ...]) -> Tensor:
-        phases, classes = batch
-        source = random_phase(phases, self.generator)
-        drawn = torch.randint(len(self.target), (len(source),), generator=self.generator)
-        target = random_phase(self.target[drawn], self.generator).to(source.device)
-        # In one pass: batch normalisation must not give either domain a scale of its own.
-        representation = pair.represent(torch.cat([source, target]))
-        logits = pair.classify(representation[: len(source)])
-        domain_logits = pair.critic(_Reversed.apply(representation, self.weight))[:, 0]
-        domains = torch.cat([torch.zeros(len(source)), torch.ones(len(target))]).to(source.device)
-        self.done += 1
-        return functional.cross_entropy(
-            logits, classes
-        ) + functional.binary_cross_entropy_with_logits(domain_logits, domains)
-
-
-def _accuracy(diagnoser: NetworkDiagnoser, held_out: Trajectories) -> float:
-    best = diagnoser.predict_proba(held_out).argmax(axis=1)
-    return float((best == class_index(held_out, diagnoser.classes).numpy()).mean())
+def _reverse(values: Tensor, weight: float) -> Tensor:
+    """The same values, whose gradient is negated and scaled (Ganin et al., section 4.2)."""
+    values = values.view_as(values)
+    values.register_hook(lambda gradient: -weight * gradient)
+    return values

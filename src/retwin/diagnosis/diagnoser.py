@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -59,6 +60,19 @@ class TrainedDiagnoser(FittedDiagnoser, Protocol):
         """How its training ended."""
 
 
+@dataclass(frozen=True, eq=False)
+class TrainingTask:
+    """What a diagnoser is trained on, and how; see the arguments of `fit_diagnoser`."""
+
+    trajectories: Trajectories
+    target: Trajectories | None
+    seed: int
+    classes: Sequence[str] | None
+    rate: float | None
+    training: Training | None
+    progress: Progress | None
+
+
 @runtime_checkable
 class Method(Protocol):
     """A config object that trains a diagnoser of its own kind; a plain network needs none.
@@ -72,19 +86,8 @@ class Method(Protocol):
 
     adapts: ClassVar[bool]
 
-    def fit(
-        self,
-        trajectories: Trajectories,
-        target: Trajectories | None,
-        /,
-        *,
-        seed: int,
-        classes: Sequence[str] | None,
-        rate: float | None,
-        training: Training | None,
-        progress: Progress | None,
-    ) -> TrainedDiagnoser:
-        """Train a diagnoser; arguments are those of `fit_diagnoser`."""
+    def fit(self, task: TrainingTask, /) -> TrainedDiagnoser:
+        """Train a diagnoser."""
 
 
 def load_diagnoser(folder: str | Path) -> FittedDiagnoser:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from retwin.checks import require, whole
-from retwin.data.trajectories import Trajectories
+from retwin.checks import instance, require, whole
+from retwin.diagnosis.diagnoser import TrainingTask
 from retwin.diagnosis.features import class_index, class_order, random_phase
 from retwin.diagnosis.network import NetworkDiagnoser
 from retwin.nets.training import Training, isolated, train
-from retwin.progress import Progress
 
 FINE_TUNING = Training(max_epochs=10, batch_size=48, learning_rate=1e-3, weight_decay=1e-2)
 """The default training. Its learning rate is a third of the first training's; it was fixed in
@@ -46,26 +44,11 @@ class FineTune:
     generated_per_labelled: int = 3
 
     def __post_init__(self) -> None:
-        require(
-            isinstance(self.base, NetworkDiagnoser),
-            "base",
-            expected="a NetworkDiagnoser",
-            got=type(self.base).__name__,
-            remedy="train one with fit_diagnoser on generated trajectories",
-        )
+        remedy = "train one with fit_diagnoser on generated trajectories"
+        instance("base", self.base, NetworkDiagnoser, remedy=remedy)
         whole("generated_per_labelled", self.generated_per_labelled, least=1)
 
-    def fit(
-        self,
-        generated: Trajectories,
-        target: Trajectories | None,
-        *,
-        seed: int,
-        classes: Sequence[str] | None,
-        rate: float | None,
-        training: Training | None,
-        progress: Progress | None,
-    ) -> NetworkDiagnoser:
+    def fit(self, task: TrainingTask) -> NetworkDiagnoser:
         """Train a copy of the base on both sets; see `fit_diagnoser`.
 
         Trajectories of the target are drawn with replacement. All epochs are run and the last is
@@ -73,23 +56,24 @@ class FineTune:
         (`Features.hide_start`), and each is sampled at a new random phase each time
         (`Features.phases`).
         """
+        generated, target = task.trajectories, task.target
         assert target is not None, "checked by fit_diagnoser"
         require(
-            classes is None and rate is None,
+            task.classes is None and task.rate is None,
             "classes and rate",
             expected="none for FineTune, which keeps those of its base",
-            got=f"{classes} and {rate}",
+            got=f"{task.classes} and {task.rate}",
             remedy="leave them out, or train another base",
         )
         base = self.base
         for part in (generated, target):
             class_order(part, base.classes)
         features = replace(base.features, hide_start=True)
-        with isolated(seed):
+        with isolated(task.seed):
             tuned = NetworkDiagnoser(base.config, features, classes=base.classes)
         tuned.load_state_dict(base.state_dict())
         real, real_class = features.phases(target), class_index(target, base.classes)
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(task.seed)
 
         def loss(module: nn.Module, batch: tuple[Tensor, ...]) -> Tensor:
             phases, labels = batch
@@ -100,7 +84,8 @@ class FineTune:
             return nn.functional.cross_entropy(module(random_phase(mixed, generator)), truth)
 
         examples = (features.phases(generated), class_index(generated, base.classes))
+        how = task.training or FINE_TUNING
         tuned.fitted = train(
-            tuned, loss, examples, None, training or FINE_TUNING, seed=seed, progress=progress
+            tuned, loss, examples, None, how, seed=task.seed, progress=task.progress
         )
         return tuned

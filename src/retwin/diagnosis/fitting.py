@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from retwin.checks import instance, require
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.diagnoser import Method, TrainedDiagnoser
+from retwin.diagnosis.diagnoser import Method, TrainedDiagnoser, TrainingTask
 from retwin.diagnosis.network import fit_network
 from retwin.nets.networks import CNN, Network
 from retwin.nets.training import Training
@@ -80,7 +79,7 @@ def fit_diagnoser(
         got="none" if target is None else f"{len(target)} trajectories",
         remedy="give real trajectories to DANN and FineTune, and to no other classifier",
     )
-    how: dict[str, Any] = {"seed": seed, "classes": classes, "rate": rate, "training": training}
+    task = TrainingTask(trajectories, target, seed, classes, rate, training, progress)
     if isinstance(classifier, Method):
-        return classifier.fit(trajectories, target, **how, progress=progress)
-    return fit_network(trajectories, classifier, **how, progress=progress)
+        return classifier.fit(task)
+    return fit_network(classifier, task)

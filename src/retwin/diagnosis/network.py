@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -12,10 +11,10 @@ from torch import Tensor, nn
 
 from retwin.catalog import CLASSIFIERS, classes
 from retwin.data.trajectories import Trajectories
+from retwin.diagnosis.diagnoser import TrainingTask
 from retwin.diagnosis.features import Features, class_index, class_names, class_order
 from retwin.nets.networks import Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
-from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 
@@ -104,19 +103,11 @@ def training_for(network: Network) -> Training:
     return getattr(network, "default_training", Training())
 
 
-def fit_network(
-    trajectories: Trajectories,
-    network: Network,
-    *,
-    seed: int,
-    classes: Sequence[str] | None = None,
-    rate: float | None = None,
-    training: Training | None = None,
-    progress: Progress | None = None,
-) -> NetworkDiagnoser:
+def fit_network(network: Network, task: TrainingTask) -> NetworkDiagnoser:
     """Train a network by cross-entropy; see `fit_diagnoser`."""
-    order = class_order(trajectories, classes)
-    features = Features.at(trajectories, rate)
+    trajectories, seed = task.trajectories, task.seed
+    order = class_order(trajectories, task.classes)
+    features = Features.at(trajectories, task.rate)
     with isolated(seed):
         model = NetworkDiagnoser(network, features, classes=order)
     # Features are split and not trajectories, which may not fit into memory.
@@ -128,15 +119,8 @@ def fit_network(
     def loss(module: nn.Module, batch: tuple[Tensor, ...]) -> Tensor:
         return nn.functional.cross_entropy(module(batch[0]), batch[1])
 
-    result = train(
-        model,
-        loss,
-        sets[0],
-        sets[1],
-        training or training_for(network),
-        seed=seed,
-        progress=progress,
-    )
+    how = task.training or training_for(network)
+    result = train(model, loss, sets[0], sets[1], how, seed=seed, progress=task.progress)
     correct = model.of_features(sets[1][0]).argmax(axis=1) == sets[1][1].numpy()
     model.fitted = replace(result, figures={"accuracy": float(correct.mean())})
     return model

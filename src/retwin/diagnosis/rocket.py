@@ -7,7 +7,6 @@ becomes a slope, is added as further channels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,10 +22,10 @@ from torch import Tensor
 
 from retwin.checks import needs_extra, require, whole
 from retwin.data.trajectories import Trajectories
+from retwin.diagnosis.diagnoser import TrainingTask
 from retwin.diagnosis.features import Features, class_index, class_names, class_order
 from retwin.nets.networks import Standardise
-from retwin.nets.training import Fit, Training
-from retwin.progress import Progress
+from retwin.nets.training import Fit
 from retwin.serialisation.models import read_model, write_model
 
 PATTERNS = 84
@@ -79,32 +78,23 @@ class Rocket:
             remedy="round it",
         )
 
-    def fit(
-        self,
-        trajectories: Trajectories,
-        target: Trajectories | None,
-        *,
-        seed: int,
-        classes: Sequence[str] | None,
-        rate: float | None,
-        training: Training | None,
-        progress: Progress | None,
-    ) -> RocketDiagnoser:
+    def fit(self, task: TrainingTask) -> RocketDiagnoser:
         """Fit MiniRocket and a ridge; see `fit_diagnoser`.
 
         The penalty of the ridge minimises the leave-one-out error on four fifths. Its scores become
         probabilities by one temperature, chosen on the held-out fifth (Guo et al., "On calibration
         of modern neural networks", ICML 2017).
         """
+        trajectories, progress = task.trajectories, task.progress
         require(
-            training is None,
+            task.training is None,
             "training",
             expected="none for Rocket, whose weights have a closed form",
-            got=training,
+            got=task.training,
             remedy="leave it out",
         )
-        order = class_order(trajectories, classes)
-        features = Features.at(trajectories, rate)
+        order = class_order(trajectories, task.classes)
+        features = Features.at(trajectories, task.rate)
         require(
             trajectories.steps > (KERNEL_LENGTH - 1) * features.stride,
             "rate",
@@ -112,10 +102,10 @@ class Rocket:
             got=f"{-(-trajectories.steps // features.stride)} samples",
             remedy="choose a higher rate or give longer trajectories",
         )
-        fitted_on, held_out = trajectories.split(0.8, seed=seed)
+        fitted_on, held_out = trajectories.split(0.8, seed=task.seed)
         before = Standardise(features.width)
         learnt = before.fit(features(fitted_on))(features(fitted_on))
-        transform = _minirocket(self.kernels, seed, _channels(learnt))
+        transform = _minirocket(self.kernels, task.seed, _channels(learnt))
         convolved = _convolved(transform, learnt)
         if progress is not None:
             progress(0.4)
@@ -141,6 +131,7 @@ class Rocket:
         )
 
 
+@dataclass(frozen=True, eq=False)
 class RocketDiagnoser:
     """A fitted transform and a linear classifier of its features.
 
@@ -158,27 +149,18 @@ class RocketDiagnoser:
     figures : dict of str to float
         `accuracy` and `log_loss` on the held-out fifth.
 
-    Attributes
-    ----------
-    fitted : Fit
-        The figures, without a history.
-
     """
 
-    def __init__(
-        self,
-        features: Features,
-        *,
-        classes: tuple[str, ...],
-        samples: int,
-        weights: dict[str, Tensor],
-        figures: dict[str, float],
-    ) -> None:
-        self.features = features
-        self.classes = classes
-        self.samples = samples
-        self.weights = weights
-        self.fitted = Fit(figures, {}, 0, "the weights of a ridge have a closed form")
+    features: Features
+    classes: tuple[str, ...]
+    samples: int
+    weights: dict[str, Tensor]
+    figures: dict[str, float]
+
+    @property
+    def fitted(self) -> Fit:
+        """The figures, without a history."""
+        return Fit(self.figures, {}, 0, "the weights of a ridge have a closed form")
 
     @cached_property
     def _transform(self) -> Any:
@@ -211,7 +193,7 @@ class RocketDiagnoser:
             "classes": self.classes,
             **self.features.about(),
             "samples": self.samples,
-            "figures": self.fitted.figures,
+            "figures": self.figures,
         }
         with write_model(folder, "rocket", about, self.weights):
             pass
@@ -238,20 +220,14 @@ class RocketDiagnoser:
 
 def _ridge(convolved: NDArray, labels: NDArray, order: tuple[str, ...]) -> tuple[NDArray, NDArray]:
     """Slope (classes, kernels) and level (classes,) of the scores of the classes in `order`."""
-    from sklearn.linear_model import RidgeClassifierCV
+    from sklearn.linear_model import RidgeCV
+    from sklearn.preprocessing import StandardScaler
 
-    centre, spread = convolved.mean(axis=0), convolved.std(axis=0)
-    spread[spread == 0] = 1.0
-    ridge = RidgeClassifierCV(alphas=PENALTIES).fit((convolved - centre) / spread, labels)
-    slope = np.atleast_2d(ridge.coef_) / spread
-    level = np.atleast_1d(ridge.intercept_) - slope @ centre
-    if len(ridge.classes_) == 2:  # two classes give one row
-        slope, level = np.concatenate([-slope, slope]), np.concatenate([-level, level])
-    whole = np.zeros((len(order), slope.shape[1]))
-    levels = np.full(len(order), ABSENT)
-    for name, row, value in zip(ridge.classes_, slope, level, strict=True):
-        whole[order.index(name)], levels[order.index(name)] = row, value
-    return whole, levels
+    truth = labels[:, None] == np.array(order)
+    scaler = StandardScaler().fit(convolved)
+    ridge = RidgeCV(alphas=PENALTIES).fit(scaler.transform(convolved), 2.0 * truth - 1)
+    slope = ridge.coef_ / scaler.scale_
+    return slope, np.where(truth.any(axis=0), ridge.intercept_ - slope @ scaler.mean_, ABSENT)
 
 
 def _temperature(scores: NDArray, truth: NDArray) -> tuple[float, float]:

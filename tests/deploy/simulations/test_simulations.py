@@ -509,10 +509,11 @@ def test_a_plan_that_cannot_be(match: str, changes: dict[str, Any]) -> None:
 
 def test_commands_of_another_twin_are_refused() -> None:
     recorded = Toy().simulate(np.zeros((2, 30, 2)), seed=0)
-    with pytest.raises(rt.InputError, match="rate of the twin, 10 Hz, got 20 Hz"):
+    with pytest.raises(rt.InputError, match=r"commands\.rate: expected that of the twin, 10"):
         plan(commands=recorded.replace(rate=20.0))
     others = rt.Channels(("a", "c"), ("V", "V"))
-    with pytest.raises(rt.InputError, match=r"inputs of the twin, a \[V\], b \[V\], got a \[V\]"):
+    named = r"commands\.inputs: expected that of the twin, a \[V\], b \[V\], got a \[V\]"
+    with pytest.raises(rt.InputError, match=named):
         plan(commands=recorded.replace(inputs=others))
     assert plan(commands=recorded.replace(inputs=None), n=None).count == 2
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
@@ -111,7 +110,15 @@ def animate(
         shots = replace(shots, drawn=body.skeleton(poses[:, _samples(one, fps)])[..., -1, :])
         chart = _chart(one, drawn.observed)
     target, inner = Path(path), picture_size(size, chart=chart is not None)
-    with write_atomically(target) as part, _pictures(shots, body, inner, renderer) as pictures:
+    with write_atomically(target) as part, ExitStack() as stack:
+        pictures: Pictures | None = None
+        try:
+            if renderer != "stick":
+                pictures = stack.enter_context(mujoco_pictures(shots, body, inner))
+        except InputError as error:
+            if renderer == "mujoco":
+                raise
+            warnings.warn(f"drawn as a stick figure: {error}", stacklevel=2)
         pages = tracked(film_pages(shots, size, pictures, chart), len(shots), progress)
         write_film(pages, part, suffix, fps=fps, size=size)
     return target
@@ -209,20 +216,3 @@ def _samples(one: Trajectories, fps: float) -> NDArray:
     count = 1 + int((one.steps - 1) / one.rate * fps + 1e-9)
     samples: NDArray = np.round(np.arange(count) / fps * one.rate).astype(int)
     return np.minimum(samples, one.steps - 1)
-
-
-@contextmanager
-def _pictures(
-    shots: Shots, body: Body, size: tuple[int, int], renderer: str
-) -> Iterator[Pictures | None]:
-    """The pictures of MuJoCo; None for stick figures, or where it cannot draw."""
-    with ExitStack() as stack:
-        found = None
-        try:
-            if renderer != "stick":
-                found = stack.enter_context(mujoco_pictures(shots, body, size))
-        except InputError as error:
-            if renderer == "mujoco":
-                raise
-            warnings.warn(f"drawn as a stick figure: {error}", stacklevel=5)
-        yield found

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,8 +38,6 @@ BROKEN = (RuntimeError, ProcessExpired, TimeoutError)
 """Errors of a worker that cannot draw."""
 GHOST_OPACITY = 0.6
 """Opacity of the ghost, from 0 to 1."""
-FLOOR, BODY, HIDDEN = 0, 1, 5
-"""MuJoCo's groups of geometry, which can be shown separately."""
 
 
 @contextmanager
@@ -94,7 +93,7 @@ def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator
                 reasons.append(f"{backend}: {why}")
                 continue
             with stack.pop_all():
-                yield (each for group in ((first,), pictures) for each in group)
+                yield chain((first,), pictures)
                 return
     raise InputError(
         "renderer",
@@ -136,20 +135,14 @@ def _draw(stage: _Stage, poses: NDArray) -> NDArray:
     to another process.
     """
     try:
-        scene = _scene(stage)
-        return np.stack([scene.picture(*pose) for pose in poses])
+        return np.stack([_Scene(stage).picture(*pose) for pose in poses])
     except InputError:
         raise
     except Exception as error:
         raise RuntimeError(f"{type(error).__name__}: {error}") from None
 
 
-@lru_cache(maxsize=1)
-def _scene(stage: _Stage) -> _Scene:
-    """The scene, which a worker keeps between its tasks."""
-    return _Scene(stage)
-
-
+@lru_cache(maxsize=1)  # a worker keeps it between its tasks
 class _Scene:
     """The model and its renderer; InputError if it lacks a joint."""
 
@@ -175,7 +168,7 @@ class _Scene:
         self._camera = mujoco.MjvCamera()
         self._camera.lookat, self._camera.distance = camera.lookat, camera.distance
         self._camera.azimuth, self._camera.elevation = camera.azimuth, camera.elevation
-        own = self._model.geom_group == BODY
+        own = self._model.geom_bodyid != 0
         self._solid = self._model.geom_rgba.copy(), self._model.geom_matid.copy()
         self._ghost = self._solid[0].copy(), np.where(own, -1, self._solid[1])
         self._ghost[0][own, :3] = GHOST
@@ -202,14 +195,10 @@ class _Scene:
 
 
 def _compiled(stage: _Stage) -> Any:
-    """The model on light paper, with what stands still in the group of the floor."""
+    """The model on light paper."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(stage.model)
-    for geom in spec.geoms:
-        # By convention groups above 2 are not shown: shapes for contact, for instance.
-        moves = geom.parent != spec.worldbody
-        geom.group = (BODY if geom.group <= 2 else HIDDEN) if moves else FLOOR
     visual = spec.visual
     visual.global_.offwidth, visual.global_.offheight = stage.camera.size
     visual.global_.fovy = stage.camera.field

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from retwin.arrays import is_finite
-from retwin.checks import at_least, one_of, require, whole
+from retwin.checks import agree, at_least, one_of, require, whole
 from retwin.data.io.header import CHUNKED_NAMES, FAILED
 from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError, place_of
@@ -105,10 +105,15 @@ class SimulationPlan:
 
     def __post_init__(self) -> None:
         one_of("dtype", self.dtype, ("float32", "float64"))
+        whose = "that of the twin"
         if not isinstance(self.commands, np.ndarray | Recorded):
-            _check_rate(self.commands.rate, self.twin)
+            remedy = "give commands at its rate, or have it run at theirs"
+            agree("commands", self.commands, self.twin, whose, names=("rate",), remedy=remedy)
         if isinstance(self.commands, Trajectories):
-            _check_channels(self.commands, self.twin)
+            # Channels without names of their own are those of the twin.
+            if self.commands.inputs != Channels.numbered("u", len(self.twin.inputs)):
+                remedy = "give commands for this twin; a file without commands needs its case"
+                agree("commands", self.commands, self.twin, whose, names=("inputs",), remedy=remedy)
             object.__setattr__(self, "commands", self.commands.commands)
         if isinstance(self.commands, np.ndarray):
             array = self._within(checked_commands(self.commands, self.twin.inputs))
@@ -316,41 +321,16 @@ def _stored(
         return SimulatedChunk(given | {"labels": classes.astype(np.int16)}, {}, made.emulated)
     finite = np.all([np.isfinite(array).all(axis=(1, 2)) for array in given.values()], axis=0)
     failed |= {int(i): f"a value is too large for {plan.dtype}" for i in good[~finite]}
+    sound = good[finite]
+    given["labels"] = classes[good].astype(np.int16)
     arrays = {
-        "commands": commands.copy(),
-        "nominal": np.zeros((len(commands), plan.steps, width), plan.dtype),
-        "observed": np.zeros((len(commands), plan.steps, width), plan.dtype),
-        "mask": np.zeros((len(commands), plan.steps, width), dtype=bool),
-        "labels": np.full(len(commands), FAILED, np.int16),
+        name: np.zeros((len(classes), *each.shape[1:]), each.dtype) for name, each in given.items()
     }
+    arrays["commands"][:], arrays["labels"][:] = commands, FAILED
     for name, values in given.items():
-        arrays[name][good[finite]] = values[finite]
-    arrays["labels"][good[finite]] = classes[good[finite]]
+        arrays[name][sound] = values[finite]
     assert tuple(arrays) == CHUNKED_NAMES
     reasons = {
         int(begin) + i: " ".join(failed[i].split())[:MAX_REASON_CHARACTERS] for i in sorted(failed)
     }
     return SimulatedChunk(arrays, reasons, made.emulated)
-
-
-def _check_rate(rate: float, twin: Twin) -> None:
-    """Refuse commands at another rate than the twin's."""
-    require(
-        rate == twin.rate,
-        "commands",
-        expected=f"the rate of the twin, {twin.rate:g} Hz",
-        got=f"{rate:g} Hz",
-        remedy="resample them, or have the twin run at their rate",
-    )
-
-
-def _check_channels(trajectories: Trajectories, twin: Twin) -> None:
-    """Refuse commands on other channels than the twin's."""
-    # Channels without names of their own are those of the twin.
-    require(
-        trajectories.inputs in (twin.inputs, Channels.numbered("u", len(twin.inputs))),
-        "commands",
-        expected=f"the inputs of the twin, {twin.inputs}",
-        got=trajectories.inputs,
-        remedy="give commands for this twin; a file without commands needs its case",
-    )
