@@ -93,12 +93,18 @@ def film_pages(
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
     canvas = FigureCanvasAgg(figure)
     inner = picture_size(size, chart=chart is not None)
-    box = (0.0, 1 - inner[1] / height, inner[0] / width, inner[1] / height)
-    text = max(9.0, min(inner[0] / 44, inner[1] / 31))
-    scene = _draw_scene(figure, box, shots, inner, pictures is not None)
-    steps = [_captions(figure, box, shots, text, size)]
+    rest = width - inner[0], height - inner[1]
+    part = figure
     if chart is not None:
-        steps.append(_draw_chart(figure, chart, shots, size, inner))
+        part, beside = (
+            figure.subfigures(1, 2, width_ratios=(inner[0], rest[0]))
+            if rest[0]
+            else figure.subfigures(2, 1, height_ratios=(inner[1], rest[1]))
+        )
+    scene = _draw_scene(part, shots, inner, pictures is not None)
+    steps = [_captions(part, shots, inner)]
+    if chart is not None:
+        steps.append(_draw_chart(beside, chart, shots, (rest[0] or width, rest[1] or height)))
     for i, picture in enumerate(repeat(None, len(shots)) if pictures is None else pictures):
         scene(i, picture)
         for step in steps:
@@ -107,19 +113,16 @@ def film_pages(
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _captions(
-    figure: Any, box: tuple[float, ...], shots: Shots, text: float, size: tuple[int, int]
-) -> Callable[[int], None]:
+def _captions(figure: Any, shots: Shots, size: tuple[int, int]) -> Callable[[int], None]:
     """Write the title, the legend, and at each frame the time."""
-    x, y = text / size[0], text / size[1]
-    points = 72 * text / DPI
-    left, bottom, right, top = box[0] + x, box[1] + y, box[2] - x, box[1] + box[3] - y
+    text = max(9.0, min(size[0] / 44, size[1] / 31))
+    x, y, points = text / size[0], text / size[1], 72 * text / DPI
     look: dict[str, Any] = {"fontsize": points, "color": INK, "va": "top"}
-    figure.text(left, top, shots.title, weight="bold", **look, parse_math=False)
-    time = figure.text(right, top, "", ha="right", **look)
+    figure.text(x, 1 - y, shots.title, weight="bold", **look, parse_math=False)
+    time = figure.text(1 - x, 1 - y, "", ha="right", **look)
     if shots.emulated:
         note = "EMULATED: no real measurements"
-        figure.text(left, top - 1.5 * y, note, weight="bold", **look | {"color": ALARM})
+        figure.text(x, 1 - 2.5 * y, note, weight="bold", **look | {"color": ALARM})
     legend = [
         (SOLID, "observed: only the tip is measured, the pose is the nearest to the nominal"),
         (GHOST, "nominal (ghost)"),
@@ -129,18 +132,18 @@ def _captions(
         legend.append((UPDATED, f"updated twin, {len(shots.drawn)} draws of the tip"))
     for place, (colour, line) in enumerate(legend):
         for shift, words, paint in ((0.0, "▬", colour), (2 * x, line, MUTED)):
-            where = left + shift, bottom + 1.5 * place * y
+            where = x + shift, (1 + 1.5 * place) * y
             figure.text(*where, words, fontsize=0.9 * points, color=paint)
     return lambda frame: time.set_text(f"{shots.seconds[frame]:.2f} s")
 
 
 def _draw_scene(
-    figure: Any, box: tuple[float, ...], shots: Shots, size: tuple[int, int], solid: bool
+    figure: Any, shots: Shots, size: tuple[int, int], solid: bool
 ) -> Callable[[int, NDArray | None], None]:
     """Draw bodies or skeletons, the paths of their tips, and the draws of an updated twin."""
     width, height = size
     unit, camera = min(size) / 480, Camera.of(shots, size)
-    axes = figure.add_axes(box, xlim=(0, width), ylim=(height, 0))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
     axes.set_axis_off()
 
     def line(colour: Any, thick: float, zorder: int, **look: Any) -> Any:
@@ -183,20 +186,14 @@ def _draw_scene(
 
 
 def _draw_chart(
-    figure: Any,
-    chart: Chart,
-    shots: Shots,
-    size: tuple[int, int],
-    inner: tuple[int, int],
+    figure: Any, chart: Chart, shots: Shots, size: tuple[int, int]
 ) -> Callable[[int], None]:
-    """Draw the bands of the updated twin and what was measured, in the part beside the picture."""
-    left = inner[0] if inner[1] == size[1] else 0
-    width, height = size[0] - left, size[1] - (0 if left else inner[1])
+    """Draw the bands of the updated twin and what was measured."""
+    width, height = size
     text = max(5.0, min(width / 42, height / 13))
     columns = 4 if width > 45 * text else 2
-    margins = 6 * text, 4.2 * text, (2.0 if columns == 4 else 3.5) * text
-    wide, tall = width - margins[0] - text, height - margins[1] - margins[2]
-    corners = (left + margins[0], margins[1], wide, tall)
+    left, bottom, top = 6 * text, 4.2 * text, (2.0 if columns == 4 else 3.5) * text
+    corners = (left, bottom, width - left - text, height - bottom - top)
     axes = figure.add_axes(tuple(np.divide(corners, (*size, *size))), facecolor=PAPER)
     points = 65 * text / DPI
     for share, alpha in ((0.9, 0.25), (0.5, 0.4)):
