@@ -90,7 +90,7 @@ def film_pages(
     from matplotlib.figure import Figure
 
     width, height = size
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
+    figure: Any = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
     canvas = FigureCanvasAgg(figure)
     inner = picture_size(size, chart=chart is not None)
     rest = width - inner[0], height - inner[1]

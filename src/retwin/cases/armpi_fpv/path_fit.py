@@ -50,10 +50,11 @@ def _hats(part: NDArray) -> NDArray:
 
 
 def _means(values: NDArray, low: NDArray, high: NDArray) -> NDArray:
-    """Mean (n, k) of values (n, T) from samples `low` to before samples `high`, both (n, k)."""
-    total = np.cumsum(np.pad(values, ((0, 0), (1, 0))), axis=1)
-    span = np.take_along_axis(total, high, axis=1) - np.take_along_axis(total, low, axis=1)
-    return span / (high - low)
+    """Mean (n, k, ...) of values (n, T, ...) from samples `low` to before `high`, both (n, k)."""
+    total = np.cumsum(np.insert(values, 0, 0, axis=1), axis=1)
+    row = np.arange(len(values))[:, None]
+    span = total[row, high] - total[row, low]
+    return span / (high - low).reshape(*high.shape, *(1,) * (values.ndim - 2))
 
 
 class PathFit:
@@ -101,8 +102,8 @@ class PathFit:
         yaw = np.unwrap(yaw, period=np.pi, axis=1)
         middle = (yaw.max(axis=1) + yaw.min(axis=1)) / 2
         self.yaw = yaw - np.pi * np.rint(middle / np.pi)[:, None]
-        self.radius = x * np.sin(self.yaw) - y * np.cos(self.yaw)
-        self.height = z - arm.base
+        radius = x * np.sin(self.yaw) - y * np.cos(self.yaw)
+        self.point = np.stack([radius, z - arm.base], axis=2)
         self.steps = np.zeros((self.count, self.moves + 1, 4))
         self.index = np.zeros((self.count, self.moves, 4), dtype=int)
         self.whole = np.zeros(self.count, dtype=bool)
@@ -173,19 +174,17 @@ class PathFit:
         none = np.zeros((self.count, 1), dtype=int)
         low = np.concatenate([none, self.last + 1], axis=1)
         high = np.concatenate([self.first + 1, none + self.length], axis=1)
-        rests = [_means(signal, low, high) for signal in (self.radius, self.height)]
-        return np.stack(rests, axis=2), ROUNDING + path_noise(self.path)
+        return _means(self.point, low, high), ROUNDING + path_noise(self.path)
 
     def _kinks(self) -> NDArray:
         """Where the path has the kink at the end of a ramp (n, M, 3), well above the tolerance."""
-        plane = np.stack([self.radius, self.height], axis=2)
         ends = self.onsets[..., None] + np.array(RAMPS) - self.closed[:, None, None]
         at = np.rint(ends).astype(int)[..., None]
         row = np.arange(self.count)[:, None, None, None]
 
         def speed(offsets: tuple[int, ...]) -> NDArray:
             index = np.clip(at + np.array(offsets), 0, self.length - 1)
-            return np.diff(plane[row, index], axis=3)
+            return np.diff(self.point[row, index], axis=3)
 
         # Without a kink, parabolas through the speed on either side meet at the end of the ramp.
         weights = np.linalg.pinv(np.vander(np.arange(-5.5, -1), 3))[-1]
@@ -206,10 +205,8 @@ class PathFit:
         yaw_error = self._yaw_error(index, parts)
         row = np.arange(self.count)[:, None, None]
         rests, self.tolerance = self._rests()
-        samples = np.stack([self.radius[row, index], self.height[row, index]], axis=-1)
-        plane = Plane(
-            self.arm, samples, parts, rests, self.tolerance, self._kinks(), yaw_error.min(axis=2)
-        )
+        samples, noise = self.point[row, index], yaw_error.min(axis=2)
+        plane = Plane(self.arm, samples, parts, rests, self.tolerance, self._kinks(), noise)
         found = grid_chain(plane, rows)
         # A single rest may be near the grid by coincidence, all rests of a path are not.
         found = found.rows(np.flatnonzero((found.cost < EXPLAINED**2).all(axis=1)))
@@ -224,7 +221,7 @@ class PathFit:
     def _yaw_error(self, index: NDArray, parts: NDArray) -> NDArray:
         """Mean square error (n, M, 3) in m^2 of the best yaw ramp of each length."""
         row = np.arange(self.count)[:, None, None]
-        self.weight = np.where(self.determined[row, index], self.radius[row, index] ** 2, 0)
+        self.weight = np.where(self.determined[row, index], self.point[row, index, 0] ** 2, 0)
         self.angle = self.yaw[row, index] / STEP
         root = np.sqrt(self.weight)[:, :, None, :, None]
         design, target = root * _hats(parts), root * self.angle[:, :, None, :, None]

@@ -84,9 +84,8 @@ class Explanations:
     ) -> Explanations:
         """Some explanations, with what comes after a movement."""
         more = self.rows(rows)
-        more.postures[:, move + 1], more.lengths[:, move], more.cost[:, move] = (
-            posture, lengths, cost,
-        )  # fmt: skip
+        more.postures[:, move + 1] = posture
+        more.lengths[:, move], more.cost[:, move] = lengths, cost
         return more
 
 

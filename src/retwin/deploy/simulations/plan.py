@@ -274,7 +274,6 @@ def _simulated(
     plan: SimulationPlan, number: int, rows: NDArray, progress: Progress | None
 ) -> SimulatedChunk:
     for_commands, for_twin = np.random.SeedSequence(plan.seed, spawn_key=(number,)).spawn(2)
-    classes = rows % len(plan.faults)
     faults = list(plan.faults.values())
     # With more threads sums would have another order, hence other bytes, and workers would compete.
     with threadpool_limits(limits=1), part_of(plan.count):
@@ -282,7 +281,7 @@ def _simulated(
         try:
             made = plan.twin.simulate(
                 commands,
-                faults=[faults[each] for each in classes],
+                faults=[faults[row % len(faults)] for row in rows],
                 seed=int(for_twin.generate_state(1)[0]),
                 progress=progress,
             )
@@ -292,20 +291,18 @@ def _simulated(
                 raise
             made, failed = error.finished, dict(error.failed)
             good = np.array([int(each) for each in made.ids], dtype=int)
-    return _stored(plan, made, good, failed, commands=commands, classes=classes, begin=rows[0])
+    return _stored(plan, rows, commands, made, good, failed)
 
 
 def _stored(
     plan: SimulationPlan,
+    rows: NDArray,
+    commands: NDArray,
     made: Trajectories,
     good: NDArray,
     failed: dict[int, str],
-    *,
-    commands: NDArray,
-    classes: NDArray,
-    begin: int,
 ) -> SimulatedChunk:
-    width = len(plan.twin.outputs)
+    classes, width = rows % len(plan.faults), len(plan.twin.outputs)
     require(
         made.observed.shape == (len(good), plan.steps, width),
         "twin",
@@ -331,6 +328,7 @@ def _stored(
         arrays[name][sound] = values[finite]
     assert tuple(arrays) == CHUNKED_NAMES
     reasons = {
-        int(begin) + i: " ".join(failed[i].split())[:MAX_REASON_CHARACTERS] for i in sorted(failed)
+        int(rows[0]) + i: " ".join(failed[i].split())[:MAX_REASON_CHARACTERS]
+        for i in sorted(failed)
     }
     return SimulatedChunk(arrays, reasons, made.emulated)
