@@ -123,7 +123,7 @@ def check_finite(name: str, array: NDArray) -> None:
                 name,
                 expected="finite numbers",
                 got=f"NaN or an infinite value in {_first(bad, rows)}",
-                remedy=f"{name} are known inputs: repair or drop that trajectory",
+                remedy="these are known inputs: repair or drop that trajectory",
             )
 
 

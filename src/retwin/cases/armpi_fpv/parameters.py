@@ -37,29 +37,10 @@ def armpi_parametric(arm: ArmPiTwin | None = None) -> ParametricTwin:
 
     """
     arm = ArmPiTwin() if arm is None else arm
-    stiffness = Parameter(
-        "stiffness",
-        "N m/rad",
-        150.0,
-        900.0,
-        GAIN / PER_RAD,
-        {
-            f"{servo}.{place}": factor * PER_RAD
-            for servo in SERVOS
-            for place, factor in (
-                ("gainprm[0]", 1.0),
-                ("biasprm[0]", -STRAIGHT),
-                ("biasprm[1]", -1.0),
-            )
-        },
-    )
-    damping = Parameter(
-        "damping",
-        "N m s/rad",
-        1.0,
-        40.0,
-        DAMPING / PER_RAD,
-        {f"{servo}.biasprm[2]": -PER_RAD for servo in SERVOS},
-    )
+    gains = {"gainprm[0]": 1.0, "biasprm[0]": -STRAIGHT, "biasprm[1]": -1.0}
+    places = {f"{servo}.{key}": gains[key] * PER_RAD for servo in SERVOS for key in gains}
+    stiffness = Parameter("stiffness", "N m/rad", 150.0, 900.0, GAIN / PER_RAD, places)
+    places = {f"{servo}.biasprm[2]": -PER_RAD for servo in SERVOS}
+    damping = Parameter("damping", "N m s/rad", 1.0, 40.0, DAMPING / PER_RAD, places)
     free = command_side_parameters(KINEMATIC.inputs, delay=(0.0, 0.2), offset=25.0)
     return ParametricTwin(CommandSide(arm, nominal=KINEMATIC.position), (stiffness, damping, *free))

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.arrays import check_finite
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.cases.armpi_fpv.path_fit import PathFit, path_noise
 from retwin.cases.armpi_fpv.twin import RAMPS, STRAIGHT
@@ -157,15 +158,7 @@ def _check(path: NDArray, arm: YawPitchArm) -> None:
         got=len(arm.links),
         remedy="pass the arm that made the path",
     )
-    bad = np.flatnonzero(~np.isfinite(path).all(axis=(1, 2)))
-    first = bad.min(initial=len(path))
-    require(
-        bad.size == 0,
-        "path",
-        expected="finite numbers",
-        got=f"NaN or inf in {bad.size} trajectories, the first at index {first}",
-        remedy="drop or repair them",
-    )
+    check_finite("path", path)
 
 
 def _movements(path: NDArray) -> list[tuple[int, int]]:
