@@ -88,11 +88,8 @@ class NetworkDiagnoser(nn.Module):
 
         """
         about, weights = read_model(folder, "diagnoser")
-        model = cls(
-            from_config(about["network"], classes(CLASSIFIERS, Network)),
-            Features.of(about),
-            classes=class_names(about["classes"]),
-        )
+        network = from_config(about["network"], classes(CLASSIFIERS, Network))
+        model = cls(network, Features.of(about), classes=class_names(about["classes"]))
         model.load_state_dict(weights)
         model.fitted = Fit.of(about["fitted"])
         return model.eval()

@@ -122,13 +122,9 @@ class Rocket:
         }
         if progress is not None:
             progress(1.0)
-        return RocketDiagnoser(
-            features,
-            classes=order,
-            samples=learnt.shape[1],
-            weights=weights,
-            figures={"accuracy": float((scores.argmax(1) == truth).mean()), "log_loss": log_loss},
-        )
+        accuracy = float((scores.argmax(1) == truth).mean())
+        figures = {"accuracy": accuracy, "log_loss": log_loss}
+        return RocketDiagnoser(features, order, learnt.shape[1], weights, figures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,12 +185,8 @@ class RocketDiagnoser:
 
     def save(self, folder: str | Path) -> None:
         """Write weights and description, see `retwin.serialisation.models`."""
-        about = {
-            "classes": self.classes,
-            **self.features.about(),
-            "samples": self.samples,
-            "figures": self.figures,
-        }
+        about = {"classes": self.classes, **self.features.about(), "samples": self.samples}
+        about["figures"] = self.figures
         with write_model(folder, "rocket", about, self.weights):
             pass
 
@@ -209,13 +201,8 @@ class RocketDiagnoser:
 
         """
         about, weights = read_model(folder, "rocket")
-        return cls(
-            Features.of(about),
-            classes=class_names(about["classes"]),
-            samples=about["samples"],
-            weights=weights,
-            figures=about["figures"],
-        )
+        names, features = class_names(about["classes"]), Features.of(about)
+        return cls(features, names, about["samples"], weights, about["figures"])
 
 
 def _ridge(convolved: NDArray, labels: NDArray, order: tuple[str, ...]) -> tuple[NDArray, NDArray]:
