@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.report.blocks import Cell, Table, columns
+from retwin.report.blocks import Table, tabulate
 from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row, draw_bands
 from retwin.report.labels import (
+    behind,
     in_sentence,
     latent_names,
     learned_name,
@@ -99,20 +100,17 @@ def learned(study: Study) -> Table | None:
         # Of a component that both have, the one that more segments identify.
         if name not in rows or row.count > rows[name].count:
             rows[name] = row
-    names = "Mean", "95 % interval", "Range of 90 % of the segments", "Generated mean", "Segments"
+    heads = ["Quantity", "Mean", "95 % interval", "Range of 90 % of the segments"]
+    heads += ["Generated mean", "Segments"]
     cells = [row.cells for row in rows.values()]
-    return (
-        Table("What was learned", columns("Quantity", *names), cells).without_empty()
-        if rows
-        else None
-    )
+    return tabulate("What was learned", heads, cells).without_empty() if rows else None
 
 
 @dataclass(frozen=True)
 class _Row:
     """A row of the table, and the number of segments that identify it."""
 
-    cells: list[Cell]
+    cells: list[str]
     count: int
 
 
@@ -172,20 +170,20 @@ def _row(name: str, unit: str, values: NDArray, generated: float | None = None) 
         hits = np.nansum(values, axis=1)
         ends = grouped_share_interval(hits, counts)
         texts = [percent(float(hits.sum() / total), 1), percents(ends), "–", "–"]
-        return _Row([Cell(text) for text in (learned_name(name), *texts, str(total))], total)
+        return _Row([learned_name(name), *texts, str(total)], total)
     means = np.nanmean(values, axis=1)
     ends = jackknife_interval(lambda weights: weights @ means, len(means))
     low, high = np.quantile(single, [0.05, 0.95])
     mean = float(means.mean())
-    digits = places(max(abs(mean), abs(low), abs(high)))
-    behind = f" {unit}" if unit not in ("", "1") else ""
+    digits = places([mean, low, high])
     texts = [
-        number(mean, digits) + behind,
-        "–" if ends is None else span(ends, digits) + behind,
-        "–" if total < SEGMENTS else span((float(low), float(high)), digits) + behind,
-        "–" if generated is None else number(generated, digits) + behind,
+        number(mean, digits),
+        span(ends, digits),
+        span((low, high) if total >= SEGMENTS else None, digits),
+        number(generated, digits),
     ]
-    return _Row([Cell(text) for text in (learned_name(name), *texts, str(total))], total)
+    texts = [text if text == "–" else behind(text, unit) for text in texts]
+    return _Row([learned_name(name), *texts, str(total)], total)
 
 
 def picture(study: Study) -> Figure | None:

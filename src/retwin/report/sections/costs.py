@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 
-from retwin.report.blocks import Cell, Column, Section, Table, columns
+from retwin.report.blocks import Cell, Column, Section, Table, tabulate, text_column
 from retwin.report.labels import duration, real_data, source_name, stage_name
 from retwin.report.study import Study
+from retwin.source_results import SourceResults
 
 PUBLISHED_BULK, BULK = 3600, 1000
 """The number of trajectories to which generation times refer: in the paper, and elsewhere."""
@@ -29,46 +31,39 @@ def _stages(study: Study) -> Table | None:
         "All jobs": timing.get("total_s"),
     }
     rows = [
-        [Cell(name), Cell(duration(float(value)))]
+        [name, duration(float(value))]
         for name, value in named.items()
         if isinstance(value, int | float) and math.isfinite(value)
     ]
-    return Table("Time of the stages", columns("Stage", "Time"), rows) if rows else None
+    return tabulate("Time of the stages", ["Stage", "Time"], rows) if rows else None
 
 
 def _costs(study: Study) -> Table | None:
     count = PUBLISHED_BULK if study.results.published else BULK
     bulk = f"{count} trajectories"
-    shown = {
-        "Twin runs": [
-            "–" if s.twin_runs is None else str(s.twin_runs) for s in study.sources.values()
-        ],
-        "Update": [duration(s.update_s) for s in study.sources.values()],
-        bulk: [duration(s.generation_seconds(count)) for s in study.sources.values()],
-        "Training": [duration(s.train_s) for s in study.sources.values()],
-        "One diagnosis": [duration(s.predict_s) for s in study.sources.values()],
+    classes = bool(study.results.classes)
+    shown: dict[str, Callable[[SourceResults], str]] = {
+        "Twin runs": lambda each: "–" if each.twin_runs is None else str(each.twin_runs),
+        "Update": lambda each: duration(each.update_s),
+        bulk: lambda each: duration(each.generation_seconds(count)),
+        "Training": lambda each: duration(each.train_s),
+        "One diagnosis": lambda each: duration(each.predict_s),
     }
-    kept = {name: texts for name, texts in shown.items() if set(texts) != {"–"}}
+    known = {name: list(map(text, study.sources.values())) for name, text in shown.items()}
+    kept = {name: texts for name, texts in known.items() if set(texts) != {"–"}}
     if not kept:
         return None
-    published = study.results.published
-    paper = bulk in kept and any("generate" in published.get(name, {}) for name in study.sources)
-    heads = [
-        Column("Training data" if study.results.classes else "Source", numeric=False),
-        Column(f"{study.word.capitalize()} data used", numeric=False),
-    ]
-    for name in kept:
-        if paper and name == bulk:
+    heads: list[object] = ["Training data" if classes else "Source"]
+    heads.append(text_column(f"{study.word.capitalize()} data used"))
+    names = [Cell(source_name(source), source=source) for source in study.sources]
+    used = [real_data(each.real_data, classes=classes) for each in study.sources.values()]
+    found: list[Sequence[object]] = [names, used]
+    published = [study.results.published.get(s, {}).get("generate", "–") for s in study.sources]
+    for name, texts in kept.items():
+        if name == bulk and set(published) != {"–"}:
             heads += [Column("this study", group=bulk), Column("paper", group=bulk, paper=True)]
+            found += [texts, published]
         else:
-            heads.append(Column(name))
-    rows = []
-    for place, (source, each) in enumerate(study.sources.items()):
-        used = real_data(each.real_data, classes=bool(study.results.classes))
-        row = [Cell(source_name(source), source=source), Cell(used)]
-        for name, texts in kept.items():
-            row.append(Cell(texts[place]))
-            if paper and name == bulk:
-                row.append(Cell(published.get(source, {}).get("generate", "–")))
-        rows.append(row)
-    return Table("Cost of a source in one run", heads, rows)
+            heads.append(name)
+            found.append(texts)
+    return tabulate("Cost of a source in one run", heads, zip(*found, strict=True))

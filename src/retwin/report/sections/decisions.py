@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from retwin.data.trajectories import HEALTHY
-from retwin.report.blocks import Cell, Section, Table, columns, grouped
+from retwin.report.blocks import Cell, Section, Table, grouped, tabulate, text_column
 from retwin.report.labels import class_name, distinct, number, percent, percents, source_name
 from retwin.report.lights import RATES, alarms
 from retwin.report.study import Study
@@ -17,8 +17,7 @@ TRAJECTORIES, FAULTY, MISSED = 1000, 0.02, 50
 """The example: trajectories, share of faulty ones, cost of a missed fault in false alarms."""
 GROUP = f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty"
 DETECTED = ("Faults detected", "Detected at the rate", "of these, correct class")
-TEXTS = ("Most often missed", "Most often confused")
-"""Heads of columns of numbers and of classes."""
+"""Heads of columns."""
 
 
 def decisions(study: Study) -> Section | None:
@@ -63,7 +62,7 @@ def _decide(study: Study, source: str, rate: float) -> Decision:
 
 def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
     """A row per source at the same false-alarm rate."""
-    heads = columns("Source", *DETECTED, "Most often missed", texts=TEXTS)
+    heads: list[object] = ["Source", *DETECTED, text_column("Most often missed")]
     heads += grouped(GROUP, f"cost, 1 : {MISSED}")
     found = {name: _decide(study, name, rate) for name in sources}
     best = max(each.detected for each in found.values())
@@ -74,38 +73,39 @@ def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
             [
                 Cell(source_name(name), name, source=name),
                 Cell(percent(each.detected), f"[{percents(each.interval)}]", each.detected == best),
-                Cell(percents(each.at_rate)),
-                Cell(percent(each.identified)),
-                Cell(class_name(each.most_missed) or "none"),
-                Cell(number(cost.total, 0)),
+                percents(each.at_rate),
+                percent(each.identified),
+                class_name(each.most_missed) or "none",
+                number(cost.total, 0),
             ]
         )
-    return Table("All sources at the same false-alarm rate", heads, rows)
+    return tabulate("All sources at the same false-alarm rate", heads, rows)
 
 
 def _table(source: str, found: list[Decision]) -> Table:
-    names = "Alarm threshold", "Its false alarms", *DETECTED, *TEXTS
-    heads = columns("Requested false-alarm rate", *names, texts=TEXTS)
+    heads: list[object] = ["Requested false-alarm rate", "Alarm threshold"]
+    heads += ["Its false alarms", *DETECTED]
+    heads += [text_column("Most often missed"), text_column("Most often confused")]
     heads += grouped(GROUP, "false alarms", "missed faults", f"cost, 1 : {MISSED}")
     digits = distinct(each.threshold for each in found)
     title = f"Cost of a false-alarm rate, {source_name(source)}"
-    return Table(title, heads, [_row(each, digits) for each in found])
+    return tabulate(title, heads, [_row(each, digits) for each in found])
 
 
-def _row(each: Decision, digits: int) -> list[Cell]:
+def _row(each: Decision, digits: int) -> list[object]:
     cost = each.cost(trajectories=TRAJECTORIES, faulty=FAULTY, missed=MISSED)
     return [
-        Cell(percent(each.requested)),
-        Cell(number(each.threshold, digits)),
-        Cell(percents(each.false_alarms)),
+        percent(each.requested),
+        number(each.threshold, digits),
+        percents(each.false_alarms),
         Cell(percent(each.detected), f"[{percents(each.interval)}]"),
-        Cell(percents(each.at_rate)),
-        Cell(percent(each.identified)),
-        Cell(class_name(each.most_missed) or "none"),
-        Cell(" as ".join(map(class_name, each.most_confused)) or "none"),
-        Cell(number(cost.false_alarms, 0)),
-        Cell(number(cost.missed_faults, 1)),
-        Cell(number(cost.total, 0)),
+        percents(each.at_rate),
+        percent(each.identified),
+        class_name(each.most_missed) or "none",
+        " as ".join(map(class_name, each.most_confused)) or "none",
+        number(cost.false_alarms, 0),
+        number(cost.missed_faults, 1),
+        number(cost.total, 0),
     ]
 
 
@@ -131,7 +131,7 @@ def _calculator(study: Study, sources: list[str], first: str, healthy: int) -> d
 
 def _entry(each: Decision, digits: int) -> dict[str, Any]:
     """The numbers that costs are computed from, and the texts of the table's cells."""
-    cells = _row(each, digits)[1:8]
+    (cells,) = tabulate("", [], [_row(each, digits)[1:8]]).rows
     return {
         "rate": each.guaranteed,
         "detected": each.detected,

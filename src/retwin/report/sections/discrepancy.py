@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from retwin.report.blocks import Cell, Section, Table, columns
+from retwin.report.blocks import Cell, Section, Table, tabulate
 from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row
 from retwin.report.labels import (
     latent_names,
@@ -150,12 +150,12 @@ def _agreement(study: Study, source: str) -> Table | None:
     fidelity = study.results.fidelity[source]
     rows = [
         [
-            Cell(latent_names(name)[0]),
+            latent_names(name)[0],
             figure_cell(distance, 2),
-            Cell(number(distance.p, 2)),
+            number(distance.p, 2),
             figure_cell(fidelity.figures.get(f"coverage90/{name}"), 2),
         ]
         for name, distance in fidelity.agreement.items()
     ]
-    heads = columns("Per segment", "KS distance", "p", "in the 90 % range")
-    return Table(titled(study, source, "Agreement per segment"), heads, rows) if rows else None
+    heads = "Per segment", "KS distance", "p", "in the 90 % range"
+    return tabulate(titled(study, source, "Agreement per segment"), heads, rows) if rows else None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.report.blocks import Cell, Column, Section, Table, columns
+from retwin.report.blocks import Cell, Section, Table, grouped, tabulate
 from retwin.report.figure import (
     Axis,
     Band,
@@ -90,7 +90,7 @@ def _overview(study: Study, sources: list[str]) -> Table:
     lengths = _lengths(study.results.fidelity[sources[0]], "")
     shown = [*lengths, *((key, title, 1.0, "") for key, title in SHARES.items())]
     shown = [each for each in shown if any(each[0] in figures for figures in known.values())]
-    heads = columns("Source", *(with_unit(title, unit) for _, title, _, unit in shown))
+    heads = ["Source", *(with_unit(title, unit) for _, title, _, unit in shown)]
     digits = dict.fromkeys(SHARES, 2) | {
         key: _digits((each.get(key) for each in known.values()), factor)
         for key, _, factor, _ in lengths
@@ -102,34 +102,34 @@ def _overview(study: Study, sources: list[str]) -> Table:
         ]
         for name, figures in known.items()
     ]
-    return Table("Fidelity of all sources", heads, rows)
+    return tabulate("Fidelity of all sources", heads, rows)
 
 
 def _digits(figures: Iterable[FidelityFigure | None], factor: float) -> int:
     """Decimals with which the scores have three digits."""
-    return places(*(factor * each.value for each in figures if each is not None))
+    return places(factor * each.value for each in figures if each is not None)
 
 
 def _scores(study: Study, source: str) -> Table:
     """CRPS and energy score of this twin and its rivals, and the paired differences."""
     each = study.results.fidelity[source]
-    heads = columns("Score", source_name(source))
+    heads: list[object] = ["Score", source_name(source)]
     for rival in each.rivals:
         name = RIVALS.get(rival, rival)
-        heads += [Column("score", group=name), Column("reduction by this twin, %", group=name)]
+        heads += grouped(name, "score", "reduction by this twin, %")
     rows = []
     for key, title, factor, unit in _lengths(each, "CRPS, mean over outputs"):
         kind, *output = key.split("/", 1)
         keys = (key, *(f"{key}/{rival}" for rival in each.rivals))
         scored = [each.figures.get(name) for name in keys]
         digits = _digits(scored, factor)
-        row = [Cell(with_unit(title, unit)), figure_cell(scored[0], digits, factor)]
+        row: list[object] = [with_unit(title, unit), figure_cell(scored[0], digits, factor)]
         for rival, theirs in zip(each.rivals, scored[1:], strict=True):
             row.append(figure_cell(theirs, digits, factor))
             below = "/".join([f"{kind}_below", *output, rival])
             row.append(figure_cell(each.figures.get(below), 0, 100.0))
         rows.append(row)
-    return Table(titled(study, source, "Scores of the draws"), heads, rows)
+    return tabulate(titled(study, source, "Scores of the draws"), heads, rows)
 
 
 def _calibration(study: Study, source: str) -> Table:
@@ -143,18 +143,12 @@ def _calibration(study: Study, source: str) -> Table:
         "auroc": ("Classifier of real against generated, AUROC", "0.50"),
     }
     rows = [
-        [
-            Cell(title),
-            Cell(number(each.figures[key].value, 2)),
-            Cell(span(each.figures[key].ends, 2)),
-            Cell(number(each.figures[key].p, 2)),
-            Cell(ideal),
-        ]
+        [title, number(found.value, 2), span(found.ends, 2), number(found.p, 2), ideal]
         for key, (title, ideal) in titles.items()
-        if key in each.figures
+        if (found := each.figures.get(key))
     ]
-    heads = columns("Calibration", "Value", "95 % interval", "p", "Ideal")
-    return Table(titled(study, source, "Calibration of the draws"), heads, rows)
+    heads = "Calibration", "Value", "95 % interval", "p", "Ideal"
+    return tabulate(titled(study, source, "Calibration of the draws"), heads, rows)
 
 
 def _figures(study: Study, source: str) -> dict[str, Figure]:

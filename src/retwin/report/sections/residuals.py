@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import runs
-from retwin.report.blocks import Cell, Section, Table, columns
+from retwin.report.blocks import Cell, Section, Table, tabulate
 from retwin.report.figure import Axis, Figure, Key, Mark, Panel, Points, Row, Spans
 from retwin.report.labels import decimals, number, p_value, quantity, source_name, with_unit
 from retwin.report.residual_panels import (
@@ -139,30 +139,23 @@ def _errors(study: Study, sources: Sequence[str]) -> list[OutputErrors]:
 def _table(
     study: Study, errors: list[OutputErrors], commands: list[ChannelRecords], outside: NDArray
 ) -> Table:
-    heads = columns(
-        "Source",
-        "RMSE",
-        "mean error",
-        "largest autocorrelation",
-        "p, white",
-        "largest correlation with a command",
-        "RMSE outside the calibration",
-    )
-    rows: list[list[Cell]] = []
+    heads = ["Source", "RMSE", "mean error", "largest autocorrelation", "p, white"]
+    heads += ["largest correlation with a command", "RMSE outside the calibration"]
+    rows: list[list[object]] = []
     for each in errors:
         if len(errors) > 1:
-            rows.append([Cell(with_unit(each.output.name, each.output.unit))])
+            rows.append([with_unit(each.output.name, each.output.unit)])
         lags = decorrelated_after(next(iter(each.by_source.values())))
         for source, error in each.by_source.items():
             found = _row(error, commands, lags, outside, _rate(study))
             rows.append([Cell(source_name(source), source=source), *found])
     title, output = "Residuals of all sources", errors[0].output
-    return Table(title if len(errors) > 1 else with_unit(title, output.unit), heads, rows)
+    return tabulate(title if len(errors) > 1 else with_unit(title, output.unit), heads, rows)
 
 
 def _row(
     error: NDArray, commands: Iterable[ChannelRecords], lags: int, outside: NDArray, rate: float
-) -> list[Cell]:
+) -> list[object]:
     """The cells of one source for one output."""
     own = autocorrelation(error)
     crossed = [(u, cross_correlation(error, u.values, lags)) for u in commands]
@@ -170,10 +163,10 @@ def _row(
     (rms, mean), (beyond, _) = _moments(error), _moments(error[outside])
     share = np.mean(outside[np.isfinite(error)]) if np.isfinite(rms) else 0.0
     return [
-        Cell(number(rms)),
-        Cell(number(mean, decimals(rms))),
+        number(rms),
+        number(mean, decimals(rms)),
         Cell(*_at_lag(own, rate)),
-        Cell(p_value(ljung_box(own)[1])),
+        p_value(ljung_box(own)[1]),
         Cell(*_at_lag(cross, rate, command.name)),
         Cell(number(beyond, decimals(rms)), f"{100 * share:.2g} % of the samples"),
     ]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from retwin.catalog import METRICS
-from retwin.report.blocks import Cell, Column, Section, Table
+from retwin.report.blocks import Cell, Column, Section, Table, tabulate
 from retwin.report.figure import Axis, Figure, Heading, Key, Mark, Panel, Points, Row
 from retwin.report.labels import (
     MAIN,
@@ -82,27 +81,25 @@ def _table_values(
     """A row per source, and what the caption states of it."""
     results = study.results
     paper = any(_in_paper(results, name) for name in metrics)
-    columns = [Column("Training data" if results.classes else "Source", numeric=False)]
     shown = {name: metric_quantity(name, results.outputs.units) for name in metrics}
-    columns += [Column(with_unit(metric_name(name), unit)) for name, (_, unit) in shown.items()]
-    if floors:
-        columns.append(Column("ECE floor"))
+    heads = ["Training data" if results.classes else "Source", *(["ECE floor"] if floors else [])]
+    heads[1:1] = [with_unit(metric_name(name), unit) for name, (_, unit) in shown.items()]
     best = {name: _best(results, name) for name in metrics}
     rows = []
     for name, source in study.sources.items():
         used = f"{study.word} data: {real_data(source.real_data, classes=bool(results.classes))}"
         known = ["fault protocol known"] if source.fault_protocol_known else []
-        row = [Cell(source_name(name), "; ".join([name, used, *known]), source=name)]
+        row: list[object] = [Cell(source_name(name), "; ".join([name, used, *known]), source=name)]
         for metric, (factor, _) in shown.items():
             values, interval = factor * np.asarray(source.runs(metric)), source.interval(metric)
             ends = [factor * end for end in interval or ()]
             below = f"[{span(ends, decimals(factor * source.mean(metric)))}]" if ends else ""
             published = results.published.get(name, {}).get(metric, "")
-            cell = Cell(mean_and_deviation(values), below, best=name in best[metric])
-            row.append(replace(cell, paper=published))
-        rows.append([*row, Cell(number(floors[name]))] if floors else row)
+            text, leads = mean_and_deviation(values), name in best[metric]
+            row.append(Cell(text, below, best=leads, paper=published))
+        rows.append([*row, number(floors[name])] if floors else row)
     return {
-        "table": Table(title, columns, rows),
+        "table": tabulate(title, heads, rows),
         "paper": paper,
         "intervals": any(source.intervals for source in study.sources.values()),
         "protocol_known": any(source.fault_protocol_known for source in study.sources.values()),
