@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.report.blocks import Table, tabulate
-from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row, draw_bands
+from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, bar, draw_bands
 from retwin.report.labels import (
     behind,
     in_sentence,
@@ -298,7 +298,7 @@ def _bars(study: Study, pair: tuple[str, str]) -> Panel | None:
         for centre, value in zip(centres, values, strict=True):
             if math.isfinite(value):
                 edges = np.array([centre + shift, centre + shift + BAR])
-                marks.append(Bars(edges, np.array([value]), title, colour))
+                marks.append(bar(edges, np.array([value]), title, colour))
     ticks = {float(centre): name for centre, name in zip(centres, names, strict=True)}
     shown = "" if unit == "σ" else unit
     simulated = study.results.overlay is None

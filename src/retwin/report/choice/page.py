@@ -9,7 +9,7 @@ from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Table, tabulate
 from retwin.report.choice.tables import comparison_table, parameter_table, term_table, units_of
 from retwin.report.choice.texts import model_sentences
-from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
+from retwin.report.figure import Band, Figure, Key, Line, Mark, record_panel
 from retwin.report.identification.figures import OUTPUTS, SAMPLES
 from retwin.report.labels import significant
 from retwin.update.forecast_errors import USUAL
@@ -86,8 +86,6 @@ def _predictions(found: Fitted) -> Figure:
             Line(times, mean, "predicted", PREDICTED, width=1.6),
         ]
         name, unit = records.outputs.names[i], records.outputs.units[i]
-        x = Axis("time", "s", (0.0, float(times[-1])), count=8)
-        y = Axis(name, "" if unit == "1" else unit)
-        panels.append(Panel(x, [Row(y, marks)], f"{name} over time", name, height=300))
+        panels.append(record_panel(times, name, unit, marks))
     keys = [Key("measured", MEASURED), Key("predicted, with its 90 % band", PREDICTED)]
     return Figure("predictions", panels, keys, str(records.ids[row]), columns=1)

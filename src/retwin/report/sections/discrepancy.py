@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from retwin.report.blocks import Cell, Section, Table, tabulate
-from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row
+from retwin.report.figure import Axis, Figure, Key, Line, Panel, Row, bar, outline
 from retwin.report.labels import (
     latent_names,
     number,
@@ -129,12 +127,9 @@ def _panel(latent: Latent, colour: str) -> Panel:
     title, label = latent_names(latent.name)
     values = latent.values
     low, high = float(values.edges[0]), float(values.edges[-1])
-    # A step to each bin's share at its left edge; the first point lifts the line from zero.
-    edges = np.concatenate([values.edges[:1], values.edges])
-    shares = np.concatenate([[0], values.generated, [0]])
-    marks: list[Mark] = [
-        Bars(values.edges, values.observed, "observed", "observed"),
-        Line(edges, shares, "generated", colour, width=2.2, step=True),
+    marks = [
+        bar(values.edges, values.observed, "observed", "observed"),
+        Line(*outline(values.edges, values.generated), "generated", colour, width=2.2),
     ]
     limits = f"{number(low, 1)} to {number(high, 1)}"
     return Panel(

@@ -19,7 +19,7 @@ from retwin.report.figure import (
     Panel,
     Row,
     draw_bands,
-    edges_of,
+    outline,
 )
 from retwin.report.labels import number, order, places, quantity, source_name, span, with_unit
 from retwin.report.sections.discrepancy import detailed, figure_cell, suffixes, titled
@@ -166,7 +166,7 @@ def _pit(source: str, name: str, pit: NDArray) -> Figure:
     count = pit.shape[1]
     edges = np.linspace(0, 1, count + 1)
     colour = colour_of(source)
-    x, measured = edges_of(pit[0], edges)
+    x, measured = (each[1:-1] for each in outline(edges, pit[0]))
     marks: list[Mark] = [
         Band(x, np.repeat(pit[1], 2), np.repeat(pit[2], 2), "perfect generators", colour, 0.25),
         Line([0, 1], [1 / count] * 2, "uniform", "muted", "dot", 1, hover=False),
