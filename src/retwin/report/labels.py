@@ -256,6 +256,11 @@ def quantity(unit: str) -> tuple[float, str]:
     return (float(counts[1]), counts[2]) if counts else (1.0, unit)
 
 
+def quantities(units: Sequence[str], count: int) -> list[tuple[float, str]]:
+    """The factor and the unit of each of so many channels, whose last ones may state no unit."""
+    return [quantity(unit) for unit in [*units, *[""] * count][:count]]
+
+
 def metric_quantity(metric: str, units: Sequence[str]) -> tuple[float, str]:
     """Factor and unit in which a score is shown, of a study whose outputs have these units.
 

@@ -144,22 +144,21 @@ def change_of(study: Study) -> tuple[ErrorChange, str] | None:
     overlay = results.overlay
     if pair is None:
         return None
-    shown = [quantity(unit) for unit in study.output_units]
+    shown = study.output_quantities
     units = {unit for _, unit in shown}
-    if overlay is None or overlay.source != pair[0] or "portrait/bands" not in study.arrays:
+    portrait = study.portrait
+    if overlay is None or overlay.source != pair[0] or not portrait:
         return _simulated_change(study, pair, units)
     healthy = study.healthy
     if not healthy.any():
         return None
-    parts = {
-        name: study.arrays[f"portrait/{name}"][healthy].astype(float)
-        for name in ("nominal", "observed", "bands")
-    }
+    names = "nominal", "observed", "bands"
+    nominal, observed, bands = (portrait[name][healthy].astype(float) for name in names)
     scale = np.array([factor for factor, _ in shown])
     if len(units) > 1:
-        spread = np.nanstd(parts["observed"], axis=(0, 1))
+        spread = np.nanstd(observed, axis=(0, 1))
         scale, units = 1 / np.where(spread > 0, spread, 1.0), {"σ"}
-    found = error_change(parts["nominal"], parts["bands"][:, 2], parts["observed"], scale)
+    found = error_change(nominal, bands[:, 2], observed, scale)
     return None if found is None else (found, next(iter(units), ""))
 
 
@@ -271,20 +270,13 @@ def _realism(study: Study, source: str) -> Light:
 
 def _noiseless(study: Study, source: str) -> list[str]:
     """The outputs at rest whose generated noise is far below the measured one."""
-    observed, predicted = (
-        study.arrays.get(f"z/{source}/{name}") for name in ("observed", "predicted")
-    )
-    fidelity = study.results.fidelity.get(source)
-    if observed is None or predicted is None or fidelity is None:
-        return []
     missing = []
-    for column, name in enumerate(fidelity.latents):
-        measured, drawn = (each[:, column] for each in (observed, predicted))
-        measured, drawn = measured[np.isfinite(measured)], drawn[np.isfinite(drawn)]
-        if not name.startswith("noise_") or not len(measured) or not len(drawn):
+    for each in study.components(source):
+        measured, drawn = (v[np.isfinite(v)] for v in (each.observed, each.predicted))
+        if not each.name.startswith("noise_") or not len(measured) or not len(drawn):
             continue
         if all(mean(drawn) < NOISELESS * mean(measured) for mean in (np.median, np.mean)):
-            missing.append(name.removeprefix("noise_"))
+            missing.append(each.name.removeprefix("noise_"))
     return missing
 
 

@@ -11,7 +11,6 @@ from retwin.report.labels import (
     latent_names,
     number,
     order,
-    quantity,
     source_name,
     span,
     with_role,
@@ -90,17 +89,11 @@ def figure_cell(figure: FidelityFigure | None, digits: int = 3, factor: float = 
 
 def latents(study: Study, source: str) -> list[Latent]:
     """Every component of z of which there are observed and generated values."""
-    both = [study.arrays.get(f"z/{source}/{name}") for name in ("observed", "predicted")]
-    fidelity = study.results.fidelity[source]
-    units = [*fidelity.latent_units, *[""] * len(fidelity.latents)]
-    found = []
-    for column, name in enumerate(fidelity.latents):
-        factor, unit = quantity(units[column])
-        values = [factor * each[:, column] for each in both if each is not None]
-        histogram = common_histogram(*values) if len(values) == 2 else None
-        if histogram is not None:
-            found.append(Latent(name, unit, histogram))
-    return found
+    return [
+        Latent(each.name, each.unit, histogram)
+        for each in study.components(source)
+        if (histogram := common_histogram(each.observed, each.predicted)) is not None
+    ]
 
 
 def _groups(study: Study, source: str) -> list[dict[str, Any]]:

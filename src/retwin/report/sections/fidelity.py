@@ -21,7 +21,7 @@ from retwin.report.figure import (
     draw_bands,
     outline,
 )
-from retwin.report.labels import number, order, places, quantity, source_name, span, with_unit
+from retwin.report.labels import number, order, places, quantities, source_name, span, with_unit
 from retwin.report.sections.discrepancy import detailed, figure_cell, suffixes, titled
 from retwin.report.study import Study
 from retwin.report.style import colour_of
@@ -76,12 +76,12 @@ def fidelity(study: Study) -> Section | None:
 
 def _lengths(each: FidelityResults, energy: str) -> list[tuple[str, str, float, str]]:
     """Key, title, factor and unit of the CRPS of each output; `energy` is put behind them."""
-    units = [*each.units, *[""] * len(each.outputs)]
-    rows = [(f"crps/{n}", f"CRPS {n}", u) for n, u in zip(each.outputs, units, strict=False)]
+    units = quantities(each.units, len(each.outputs))
+    rows = [(f"crps/{n}", f"CRPS {n}", *u) for n, u in zip(each.outputs, units, strict=True)]
     if energy and len(each.outputs) > 1:
-        rows.append(("crps", energy, ""))
-    rows.append(("energy", "Energy score", units[0] if len(set(each.units)) == 1 else ""))
-    return [(key, title, *quantity(unit)) for key, title, unit in rows]
+        rows.append(("crps", energy, 1.0, ""))
+    common = units[0] if len(set(each.units)) == 1 else (1.0, "")
+    return [*rows, ("energy", "Energy score", *common)]
 
 
 def _overview(study: Study, sources: list[str]) -> Table:
@@ -191,14 +191,14 @@ def _bands(study: Study, source: str, name: str) -> Figure:
     The first trajectory is the typical one, the second the worst.
     """
     parts, each = study.bands(source), study.results.fidelity[source]
-    units = [*each.units, *[""] * len(each.outputs)]
+    units = quantities(each.units, len(each.outputs))
     residual = np.where(parts["seen"][..., None], parts["observed"] - parts["nominal"], np.nan)
     quantiles = parts["quantiles"] - parts["nominal"][:, None]
     time = np.arange(residual.shape[1]) / float(parts["rate"])
     panels = []
     for i, trajectory in enumerate(parts["ids"].tolist()):
         for c, output in enumerate(each.outputs):
-            factor, unit = quantity(units[c])
+            factor, unit = units[c]
             marks: list[Mark] = [
                 *draw_bands(time, factor * quantiles[i, :, :, c], colour_of(source)),
                 Line(time, factor * residual[i, :, c], "measured", "ink", width=1.6),
