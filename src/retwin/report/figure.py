@@ -74,10 +74,13 @@ class Points:
 
 @dataclass(frozen=True)
 class Spans:
-    """Intervals (n, 2) of x that are shaded."""
+    """Intervals (n, 2) of x that are shaded, from the bottom to a share of the height."""
 
     intervals: Sequence[tuple[float, float]]
     colour: str = "grid"
+    alpha: float = 1
+    height: float = 1
+    outline: float = 0
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,8 @@ class Axis:
         Ticks at most, where neither is given.
     from_zero : bool
         Whether the axis begins at 0.
+    bare : bool
+        Whether ticks have no labels.
 
     """
 
@@ -133,6 +138,7 @@ class Axis:
     ticks: Mapping[float, str] = field(default_factory=dict)
     count: int = 6
     from_zero: bool = False
+    bare: bool = False
 
     @property
     def title(self) -> str:
@@ -146,6 +152,11 @@ class Row:
 
     y: Axis
     marks: Sequence[Mark]
+
+    @property
+    def drawn(self) -> list[Mark]:
+        """The marks, with no more samples than can be seen."""
+        return list(map(envelope, self.marks))
 
 
 @dataclass(frozen=True)
@@ -191,6 +202,8 @@ class Figure:
         Panels side by side in the PNG, at most.
     narrow : bool
         Whether its caption stands beside it on the page where there is room.
+    title : str
+        A heading of the PNG.
 
     """
 
@@ -200,6 +213,7 @@ class Figure:
     source: str = ""
     columns: int = 3
     narrow: bool = False
+    title: str = ""
 
 
 @dataclass(frozen=True)

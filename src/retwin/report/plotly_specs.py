@@ -25,7 +25,6 @@ from retwin.report.figure import (
     Panel,
     Points,
     Spans,
-    envelope,
 )
 
 FORMATS = {"share": ".1f", "percent": ".0%"}
@@ -55,8 +54,8 @@ def panel_spec(panel: Panel) -> dict[str, Any]:
         layout["yaxis2"] = _axis(others[0].y) | lower
     parts: dict[str, list[dict[str, Any]]] = {"data": [], "shapes": [], "annotations": []}
     for row, own in zip(panel.rows, ({}, {"yaxis": "y2"}), strict=False):
-        for mark in row.marks:
-            for kind, part in _parts(envelope(mark), panel.x, row.y):
+        for mark in row.drawn:
+            for kind, part in _parts(mark, panel.x, row.y):
                 parts[kind].append(part | (own if kind == "data" else {}))
     data = parts.pop("data")
     layout |= {kind: found for kind, found in parts.items() if found}
@@ -75,6 +74,8 @@ def _axis(axis: Axis) -> dict[str, Any]:
         made |= {"showgrid": False, "ticks": "", "showline": False}
     if axis.kind in FORMATS:
         made["tickformat"] = FORMATS[axis.kind]
+    if axis.bare:
+        made["showticklabels"] = False
     if axis.from_zero:
         made["rangemode"] = "tozero"
     if axis.ticks:
@@ -105,9 +106,10 @@ def _parts(mark: Mark, x: Axis, y: Axis) -> Iterator[tuple[str, dict[str, Any]]]
             yield "data", _points(mark, where)
         case Spans():
             for start, end in mark.intervals:
-                look = {"layer": "below", "fillcolor": f"@{mark.colour}", "line": {"width": 0}}
-                area = {"yref": "paper", "y0": 0, "y1": 1, "x0": start, "x1": end}
-                yield "shapes", {"type": "rect", **area, **look}
+                line = {"width": mark.outline, "color": f"@{mark.colour}"}
+                look = {"fillcolor": _colour(mark.colour, mark.alpha), "line": line}
+                area = {"yref": "paper", "y0": 0, "y1": mark.height, "x0": start, "x1": end}
+                yield "shapes", {"type": "rect", "layer": "below", **area, **look}
         case Dimension():
             (x0, y0), (x1, y1) = mark.start, mark.end
             line = {"color": f"@{mark.colour}", "width": 4}

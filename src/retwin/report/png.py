@@ -47,6 +47,8 @@ def png(shown: Figure | Matrices, *, emulated: bool) -> bytes:
     if emulated:
         heading = "EMULATED data: no real measurements"
         canvas.suptitle(heading, color=hexadecimal("alarm"), fontsize=10)
+    elif isinstance(shown, Figure):
+        canvas.suptitle(shown.title, color=hexadecimal("ink"), fontsize=10)
     canvas.set_dpi(160)
     drawn = FigureCanvasAgg(canvas)
     drawn.draw()
@@ -116,7 +118,7 @@ def _figure(figure: Figure) -> Canvas:
 
 def _panel(axes: Axes, panel: Panel, row: Row, *, last: bool) -> None:
     dress(axes, panel.x.title if last else "", row.y.title)
-    for mark in row.marks:
+    for mark in row.drawn:
         _mark(axes, mark)
     _scale(axes, panel.x, "x")
     _scale(axes, row.y, "y")
@@ -139,6 +141,8 @@ def _scale(axes: Axes, axis: Axis, which: Literal["x", "y"]) -> None:
     if axis.kind == "names":
         axes.grid(visible=False, axis=which)
         axes.tick_params(axis=which, length=0, labelcolor=hexadecimal("ink"))
+    if axis.bare:
+        axes.tick_params(axis=which, labelbottom=False, labelleft=False)
     if axis.limits is not None:
         limit(*axis.limits)
     elif axis.from_zero:
@@ -162,8 +166,9 @@ def _mark(axes: Axes, mark: Mark) -> None:
             look |= {f"{mark.along}err": mark.intervals} | _symbol(mark.symbol, look["color"])
             axes.errorbar(mark.x, mark.y, linestyle=STYLES.get(mark.dash, "none"), **look)
         case Spans():
+            area = {"facecolor": (look["color"], mark.alpha), "edgecolor": look["color"]}
             for start, end in mark.intervals:
-                axes.axvspan(start, end, linewidth=0, zorder=0, **look)
+                axes.axvspan(start, end, 0, mark.height, linewidth=mark.outline, zorder=0, **area)
         case Dimension():
             axes.plot(*zip(mark.start, mark.end, strict=True), linewidth=3, **look)
         case Heading():
