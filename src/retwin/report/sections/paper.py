@@ -15,7 +15,7 @@ from retwin.report.labels import (
     order,
     source_name,
 )
-from retwin.report.sections.costs import PUBLISHED_BULK
+from retwin.report.sections.time import PUBLISHED_BULK
 from retwin.report.study import Study
 
 TABLE1 = tuple(name for name in MAIN if not METRICS[name].simulated)

@@ -29,13 +29,7 @@ from retwin.report.labels import (
 from retwin.report.study import Study
 from retwin.report.style import colour_of, symbol
 from retwin.results import Results
-from retwin.scores.calibration import calibration_floor
 from retwin.source_results import SourceResults
-
-FURTHER = tuple(
-    name for name, metric in METRICS.items() if not metric.headline and metric.unit == "1"
-)
-"""The metrics of the second table."""
 
 
 def scores(study: Study) -> Section | None:
@@ -43,7 +37,7 @@ def scores(study: Study) -> Section | None:
     shown = [name for name in MAIN if study.results.has(name)]
     if not shown:
         return None
-    values = _table_values(study, shown, "Scores of all sources")
+    values = table_values(study, shown, "Scores of all sources")
     if not study.results.classes:
         table = values["table"]
         costs = [Cell(duration(source.update_s)) for source in study.sources.values()]
@@ -58,24 +52,7 @@ def scores(study: Study) -> Section | None:
     return Section("scores", "Scores", values, figures)
 
 
-def further_scores(study: Study) -> Section | None:
-    """The scores that the paper does not give, and the noise floor of the calibration error."""
-    shown = [name for name in FURTHER if study.results.has(name)]
-    if not shown:
-        return None
-    ece = study.results.has("ece")
-    floors = {
-        name: calibration_floor(study.probabilities(name)) if name in study.diagnosing else None
-        for name in (study.sources if ece else ())
-    }
-    computed = any(floor is not None for floor in floors.values())
-    title = "Further scores of all sources"
-    values = _table_values(study, shown, title, floors if computed else {})
-    values |= {"ece": ece, "computed": computed, "count": study.results.data.test.size or "few"}
-    return Section("further", "Further scores", values)
-
-
-def _table_values(
+def table_values(
     study: Study, metrics: Sequence[str], title: str, floors: dict[str, float | None] | None = None
 ) -> dict[str, Any]:
     """A row per source, and what the caption states of it."""
