@@ -45,7 +45,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Points:
-    """Symbols at (x, y), with intervals `low` to `high` along an axis, and a line if it has a dash.
+    """Symbols at (x, y), with intervals `ends` (n, 2) along an axis, and a line if it has a dash.
 
     `texts` are shown where a reader points at them.
     """
@@ -55,8 +55,7 @@ class Points:
     name: str
     colour: str
     symbol: str = "circle"
-    low: ArrayLike | None = None
-    high: ArrayLike | None = None
+    ends: Sequence[tuple[float, float]] = ()
     along: Literal["x", "y"] = "x"
     texts: Sequence[str] = ()
     dash: str = ""
@@ -66,10 +65,11 @@ class Points:
     @property
     def intervals(self) -> NDArray | None:
         """How far the intervals reach below and above the points (2, n); None without."""
-        if self.low is None or self.high is None:
+        if not self.ends:
             return None
         middle = np.asarray(self.x if self.along == "x" else self.y, dtype=float)
-        return np.maximum([middle - np.asarray(self.low), np.asarray(self.high) - middle], 0)
+        low, high = np.transpose(self.ends)
+        return np.maximum([middle - low, high - middle], 0)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from retwin.data.trajectories import HEALTHY
 from retwin.errors import InputError
 from retwin.report.labels import order, quantities
 from retwin.results import FidelityResults, Results, read_results
+from retwin.scores.decisions import Decision, decide
 from retwin.source_results import SourceResults
 
 AGAIN = "run `retwin study` with this folder as --out again"
@@ -192,6 +193,10 @@ class Study:
     def probabilities(self, source: str) -> NDArray:
         """Probabilities of shape (runs, n, classes); empty if there are none."""
         return self.arrays.get(f"probabilities/{source}", np.empty(0))
+
+    def decision(self, source: str, rate: float) -> Decision:
+        """The decision at a false-alarm rate of the first run: a threshold belongs to one model."""
+        return decide(self.probabilities(source)[0], self.truth, self.results.classes, rate)
 
     def bands(self, source: str) -> dict[str, NDArray]:
         """The arrays `bands/SOURCE/…` by the last part of the name; empty if one is missing."""

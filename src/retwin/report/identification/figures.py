@@ -58,12 +58,13 @@ def _estimates(found: Identification) -> Figure:
 
     ends = [each.interval or (each.value, each.value) for each in known]
     start, value = (shares(getattr(each, name) for each in known) for name in ("start", "value"))
-    below, above = (np.clip(shares(values), 0, 1) for values in zip(*ends, strict=True))
+    inside = [np.clip(shares(values), 0, 1).tolist() for values in zip(*ends, strict=True)]
+    bars = list(zip(*inside, strict=True))
     texts = [behind(f"{each.name}: {each.value:.4g}", each.unit) for each in known]
     first = [f"{each.name} before: {each.start:.4g}" for each in known]
     marks: list[Mark] = [
         Points(start, place, "before", BEFORE, "diamond-open", texts=first),
-        Points(value, place, "after", AFTER, low=below, high=above, texts=texts, bar_width=3),
+        Points(value, place, "after", AFTER, ends=bars, texts=texts, bar_width=3),
     ]
     ticks = {at: each.name for at, each in zip(place.tolist(), known, strict=True)}
     panel = Panel(

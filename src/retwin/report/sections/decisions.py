@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from retwin.data.trajectories import HEALTHY
 from retwin.report.blocks import Cell, Section, Table, grouped, tabulate, text_column
 from retwin.report.labels import class_name, distinct, number, percent, percents, source_name
 from retwin.report.lights import RATES, alarms
 from retwin.report.study import Study
 from retwin.report.verdict import headline
-from retwin.scores.decisions import Decision, decide
+from retwin.scores.decisions import Decision
 
 TRAJECTORIES, FAULTY, MISSED = 1000, 0.02, 50
 """The example: trajectories, share of faulty ones, cost of a missed fault in false alarms."""
@@ -32,18 +31,15 @@ def decisions(study: Study) -> Section | None:
     pair = headline(study.results)
     best = max(sources, key=lambda name: study.sources[name].mean("macro_f1"), default=None)
     best = pair[0] if pair is not None and pair[0] in sources else best
-    if best is None or HEALTHY not in study.results.classes:
+    chosen = None if best is None else alarms(study, best)
+    if best is None or chosen is None:
         return None
-    healthy = int((study.truth == study.results.classes.index(HEALTHY)).sum())
-    if healthy in (0, len(study.truth)):
-        return None
-    found = [_decide(study, best, rate) for rate in RATES]
+    found = [study.decision(best, rate) for rate in RATES]
     short = [each.requested for each in found if math.isnan(each.threshold)]
-    chosen = alarms(study, best)
-    rate = chosen.decision.guaranteed if chosen and chosen.decision else math.nan
+    rate = chosen.decision.guaranteed if chosen.decision else math.nan
     values = {
         "source": best,
-        "healthy": healthy,
+        "healthy": chosen.healthy,
         "chosen": chosen,
         "all": None if math.isnan(rate) else _all_sources(study, sources, rate),
         "table": _table(best, [each for each in found if math.isfinite(each.threshold)]),
@@ -51,20 +47,17 @@ def decisions(study: Study) -> Section | None:
         "lowest": short[-1] if short else None,
         "needed": math.ceil(1 / short[-1]) - 1 if short else 0,
     }
-    scripts = {"calculator": _calculator(study, sources, best, healthy) | {"rate": 100 * rate}}
+    scripts = {
+        "calculator": _calculator(study, sources, best, chosen.healthy) | {"rate": 100 * rate}
+    }
     return Section("decisions", "Decisions", values, scripts=scripts)
-
-
-def _decide(study: Study, source: str, rate: float) -> Decision:
-    first = study.probabilities(source)[0]
-    return decide(first, study.truth, study.results.classes, rate)
 
 
 def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
     """A row per source at the same false-alarm rate."""
     heads: list[object] = ["Source", *DETECTED, text_column("Most often missed")]
     heads += grouped(GROUP, f"cost, 1 : {MISSED}")
-    found = {name: _decide(study, name, rate) for name in sources}
+    found = {name: study.decision(name, rate) for name in sources}
     best = max(each.detected for each in found.values())
     rows = []
     for name, each in found.items():
@@ -112,7 +105,7 @@ def _row(each: Decision, digits: int) -> list[object]:
 def _calculator(study: Study, sources: list[str], first: str, healthy: int) -> dict[str, Any]:
     """Every distinct decision of each source: there are as many as healthy trajectories."""
     rates = [rank / (healthy + 1) for rank in range(1, healthy + 1)]
-    decided = {name: [_decide(study, name, rate) for rate in rates] for name in sources}
+    decided = {name: [study.decision(name, rate) for rate in rates] for name in sources}
     return {
         "healthy": healthy,
         "first": sources.index(first),

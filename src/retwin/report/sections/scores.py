@@ -108,12 +108,15 @@ def _figure(study: Study, metrics: Sequence[str]) -> Figure:
     keys = [Key(source_name(name), colour_of(name), symbol(name)) for name in sources]
     for name, source in sources.items():
         marks.append(_points(name, source, metrics, lanes[name]))
-        values = study.results.published.get(name, {})
-        found = {m: _published(values[m]) for m in metrics if m in values}
-        known = [(m, value) for m, value in found.items() if value is not None]
+        texts = study.results.published.get(name, {})
+        known = {m: each for m in metrics if (each := _published(texts.get(m, "")))}
         if known:
-            heights = [metrics.index(m) + lanes[name] + 0.35 * width for m, _ in known]
-            marks.append(_published_points(name, [value for _, value in known], heights))
+            means = [mean for mean, _ in known.values()]
+            title, look = f"{source_name(name)} (paper)", (colour_of(name), "diamond-open")
+            heights = [metrics.index(m) + lanes[name] + 0.35 * width for m in known]
+            ends = [(mean - deviation, mean + deviation) for mean, deviation in known.values()]
+            shown = list(map(number, means))
+            marks.append(Points(means, heights, title, *look, ends, texts=shown, bar_width=1))
     if len(marks) > len(metrics) + len(sources):
         keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond-open"))
     ticks = {
@@ -142,27 +145,9 @@ def _points(name: str, source: SourceResults, metrics: Sequence[str], lane: floa
         source_name(name),
         colour_of(name),
         symbol(name),
-        low=[low for low, _ in ends],
-        high=[high for _, high in ends],
+        ends=ends,
         texts=[f"{mean_and_deviation(source.runs(m))} [{span(source.interval(m))}]" for m in shown],
         size=10,
-    )
-
-
-def _published_points(
-    name: str, values: Sequence[tuple[float, float]], heights: Sequence[float]
-) -> Points:
-    """The paper's means with one standard deviation, as open diamonds."""
-    return Points(
-        [mean for mean, _ in values],
-        heights,
-        f"{source_name(name)} (paper)",
-        colour_of(name),
-        "diamond-open",
-        low=[mean - deviation for mean, deviation in values],
-        high=[mean + deviation for mean, deviation in values],
-        texts=[number(mean) for mean, _ in values],
-        bar_width=1,
     )
 
 
