@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -54,10 +54,9 @@ class Column:
     paper: bool = False
 
 
-def columns(text: str, *others: str, texts: Sequence[str] = ()) -> list[Column]:
-    """A column of text, and others of numbers, but for those of `texts`."""
-    rest = [Column(name, numeric=name not in texts) for name in others]
-    return [Column(text, numeric=False), *rest]
+def text_column(text: str, group: str = "") -> Column:
+    """A column of text."""
+    return Column(text, group, numeric=False)
 
 
 def grouped(group: str, *names: str) -> list[Column]:
@@ -93,6 +92,19 @@ class Table:
             else:
                 runs.append((column.group, 1))
         return runs
+
+
+def tabulate(title: str, heads: Iterable[object], rows: Iterable[Iterable[object]]) -> Table:
+    """A table whose heads and cells may be plain: texts, or what has one.
+
+    The first plain head is that of a column of text, others are those of columns of numbers.
+    """
+    columns = [
+        each if isinstance(each, Column) else Column(str(each), numeric=place > 0)
+        for place, each in enumerate(heads)
+    ]
+    cells = [[each if isinstance(each, Cell) else Cell(str(each)) for each in row] for row in rows]
+    return Table(title, columns, cells)
 
 
 def _empty(cell: Cell) -> bool:

@@ -6,16 +6,19 @@ Colours are names: `c0` to `c7` of the palette, or those of `retwin.report.style
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+MAX_POINTS = 4000
+"""Samples beyond which a line is drawn as the smallest and the largest value of groups."""
+
 
 @dataclass(frozen=True)
 class Line:
-    """A line through points (n,), NaN for a break; `step` holds each value up to the next x."""
+    """A line through points (n,), NaN for a break; `filled` down to zero."""
 
     x: ArrayLike
     y: ArrayLike
@@ -23,7 +26,7 @@ class Line:
     colour: str
     dash: str = "solid"
     width: float = 1.8
-    step: bool = False
+    filled: bool = False
     hover: bool = True
     alpha: float = 1
 
@@ -42,7 +45,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Points:
-    """Symbols at (x, y), with intervals `low` to `high` along an axis, and a line if it has a dash.
+    """Symbols at (x, y), with intervals `ends` (n, 2) along an axis, and a line if it has a dash.
 
     `texts` are shown where a reader points at them.
     """
@@ -52,31 +55,32 @@ class Points:
     name: str
     colour: str
     symbol: str = "circle"
-    low: ArrayLike | None = None
-    high: ArrayLike | None = None
+    ends: Sequence[tuple[float, float]] = ()
     along: Literal["x", "y"] = "x"
     texts: Sequence[str] = ()
     dash: str = ""
     size: int = 9
     bar_width: float = 2
 
-
-@dataclass(frozen=True)
-class Bars:
-    """A histogram: heights (n,) between edges (n + 1,)."""
-
-    edges: NDArray
-    heights: NDArray
-    name: str
-    colour: str
+    @property
+    def intervals(self) -> NDArray | None:
+        """How far the intervals reach below and above the points (2, n); None without."""
+        if not self.ends:
+            return None
+        middle = np.asarray(self.x if self.along == "x" else self.y, dtype=float)
+        low, high = np.transpose(self.ends)
+        return np.maximum([middle - low, high - middle], 0)
 
 
 @dataclass(frozen=True)
 class Spans:
-    """Intervals (n, 2) of x that are shaded."""
+    """Intervals (n, 2) of x that are shaded, from the bottom to a share of the height."""
 
     intervals: Sequence[tuple[float, float]]
     colour: str = "grid"
+    alpha: float = 1
+    height: float = 1
+    outline: float = 0
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,7 @@ class Heading:
     y: float
 
 
-Mark = Line | Band | Points | Bars | Spans | Dimension | Heading
+Mark = Line | Band | Points | Spans | Dimension | Heading
 
 
 @dataclass(frozen=True)
@@ -121,6 +125,8 @@ class Axis:
         Ticks at most, where neither is given.
     from_zero : bool
         Whether the axis begins at 0.
+    bare : bool
+        Whether ticks have no labels.
 
     """
 
@@ -132,11 +138,12 @@ class Axis:
     ticks: Mapping[float, str] = field(default_factory=dict)
     count: int = 6
     from_zero: bool = False
+    bare: bool = False
 
     @property
     def title(self) -> str:
         """The quantity with its unit."""
-        return f"{self.label}, {self.unit}" if self.unit else self.label
+        return self.label if self.unit in ("", "1") else f"{self.label}, {self.unit}"
 
 
 @dataclass(frozen=True)
@@ -145,6 +152,11 @@ class Row:
 
     y: Axis
     marks: Sequence[Mark]
+
+    @property
+    def drawn(self) -> list[Mark]:
+        """The marks, with no more samples than can be seen."""
+        return list(map(envelope, self.marks))
 
 
 @dataclass(frozen=True)
@@ -190,6 +202,8 @@ class Figure:
         Panels side by side in the PNG, at most.
     narrow : bool
         Whether its caption stands beside it on the page where there is room.
+    title : str
+        A heading of the PNG.
 
     """
 
@@ -199,6 +213,7 @@ class Figure:
     source: str = ""
     columns: int = 3
     narrow: bool = False
+    title: str = ""
 
 
 @dataclass(frozen=True)
@@ -231,6 +246,37 @@ def draw_bands(x: ArrayLike, quantiles: ArrayLike, colour: str, alpha: float = 0
     ]
 
 
-def edges_of(values: NDArray, edges: NDArray) -> tuple[NDArray, NDArray]:
-    """The outline (x, y) of a histogram's shares (n,) between edges (n + 1,)."""
-    return np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
+def outline(edges: NDArray, shares: NDArray) -> tuple[NDArray, NDArray]:
+    """The outline (x, y) of a histogram's shares (n,) between edges (n + 1,), from zero to zero."""
+    return np.repeat(edges, 2), np.concatenate([[0.0], np.repeat(shares, 2), [0.0]])
+
+
+def bar(edges: NDArray, shares: NDArray, name: str, colour: str) -> Line:
+    """A filled histogram."""
+    return Line(*outline(edges, shares), name, colour, width=0, filled=True)
+
+
+def record_panel(times: NDArray, name: str, unit: str, marks: Sequence[Mark]) -> Panel:
+    """An output over time."""
+    x = Axis("time", "s", (float(times[0]), float(times[-1])), count=8)
+    return Panel(x, [Row(Axis(name, unit), marks)], f"{name} over time", name, height=300)
+
+
+def envelope(mark: Mark) -> Mark:
+    """A line or a band of very many samples as its extremes in groups, so that no peak is lost."""
+    if not isinstance(mark, Line | Band) or len(np.asarray(mark.x)) <= MAX_POINTS:
+        return mark
+    x = np.asarray(mark.x, dtype=float)
+    if np.any(np.diff(x) < 0):
+        return mark
+    starts = np.linspace(0, len(x), MAX_POINTS // 2 + 1).astype(int)[:-1]
+
+    def extremes(least: ArrayLike, greatest: ArrayLike) -> list[NDArray]:
+        pairs = ((np.fmin, least), (np.fmax, greatest))
+        return [each.reduceat(np.asarray(values, float), starts) for each, values in pairs]
+
+    if isinstance(mark, Band):
+        low, high = extremes(mark.low, mark.high)
+        return replace(mark, x=x[starts], low=low, high=high)
+    y = np.stack(extremes(mark.y, mark.y), axis=1).ravel()
+    return replace(mark, x=np.repeat(x[starts], 2), y=y)

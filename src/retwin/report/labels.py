@@ -158,10 +158,19 @@ def decimals(*values: float) -> int:
     return 2 - math.floor(math.log10(largest))
 
 
-def places(*values: float) -> int:
+def places(values: Iterable[float]) -> int:
     """Decimals that leave three significant digits of the largest value, nine decimals at most."""
     largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
     return 3 if largest == 0 else max(0, min(9, 2 - math.floor(math.log10(largest))))
+
+
+def significant(value: float, like: float | None = None) -> str:
+    """A number with four digits, or with as many decimals as two digits of `like` have."""
+    if not math.isfinite(value):
+        return "–"
+    digits = 1 - math.floor(math.log10(like)) if like and 0 < like < math.inf else 9
+    form = ".4g" if digits > 8 or abs(value) >= 1e6 else f".{max(digits, 0)}f"
+    return f"{value:{form}}".replace("-", "−")
 
 
 def distinct(values: Iterable[float]) -> int:
@@ -247,6 +256,11 @@ def quantity(unit: str) -> tuple[float, str]:
     return (float(counts[1]), counts[2]) if counts else (1.0, unit)
 
 
+def quantities(units: Sequence[str], count: int) -> list[tuple[float, str]]:
+    """The factor and the unit of each of so many channels, whose last ones may state no unit."""
+    return [quantity(unit) for unit in [*units, *[""] * count][:count]]
+
+
 def metric_quantity(metric: str, units: Sequence[str]) -> tuple[float, str]:
     """Factor and unit in which a score is shown, of a study whose outputs have these units.
 
@@ -274,9 +288,14 @@ def difference(each: Comparison, units: Sequence[str]) -> tuple[str, str]:
     )
 
 
+def shown_unit(unit: str) -> str:
+    """The unit; "" for that of a plain number."""
+    return "" if unit == "1" else unit
+
+
 def behind(text: str, unit: str) -> str:
     """The text with the unit behind it."""
-    return text if unit in ("", "1") else f"{text} {unit}"
+    return f"{text} {shown_unit(unit)}".rstrip()
 
 
 def with_unit(title: str, unit: str) -> str:

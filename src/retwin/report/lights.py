@@ -16,15 +16,14 @@ import numpy as np
 
 from retwin.catalog import METRICS
 from retwin.data.trajectories import HEALTHY
-from retwin.report.labels import quantity, source_name
+from retwin.report.labels import quantity
 from retwin.report.study import Study
-from retwin.report.verdict import headline
+from retwin.report.verdict import decisive, headline
 from retwin.scores.change import ErrorChange, error_change
 from retwin.scores.comparison import MIN_RUNS, compliance
 from retwin.scores.decisions import (
     Decision,
     certain_decision,
-    decide,
     detection_difference,
     healthy_needed,
 )
@@ -144,22 +143,21 @@ def change_of(study: Study) -> tuple[ErrorChange, str] | None:
     overlay = results.overlay
     if pair is None:
         return None
-    shown = [quantity(unit) for unit in study.output_units]
+    shown = study.output_quantities
     units = {unit for _, unit in shown}
-    if overlay is None or overlay.source != pair[0] or "portrait/bands" not in study.arrays:
+    portrait = study.portrait
+    if overlay is None or overlay.source != pair[0] or not portrait:
         return _simulated_change(study, pair, units)
     healthy = study.healthy
     if not healthy.any():
         return None
-    parts = {
-        name: study.arrays[f"portrait/{name}"][healthy].astype(float)
-        for name in ("nominal", "observed", "bands")
-    }
+    names = "nominal", "observed", "bands"
+    nominal, observed, bands = (portrait[name][healthy].astype(float) for name in names)
     scale = np.array([factor for factor, _ in shown])
     if len(units) > 1:
-        spread = np.nanstd(parts["observed"], axis=(0, 1))
+        spread = np.nanstd(observed, axis=(0, 1))
         scale, units = 1 / np.where(spread > 0, spread, 1.0), {"σ"}
-    found = error_change(parts["nominal"], parts["bands"][:, 2], parts["observed"], scale)
+    found = error_change(nominal, bands[:, 2], observed, scale)
     return None if found is None else (found, next(iter(units), ""))
 
 
@@ -212,7 +210,7 @@ def alarms(study: Study, source: str) -> Alarms | None:
     first = study.probabilities(source)[0]
     for rate in (each for each in RATES if each >= RATE):
         safe = certain_decision(first, study.truth, classes, rate)
-        found = safe or decide(first, study.truth, classes, rate)
+        found = safe or study.decision(source, rate)
         if math.isfinite(found.threshold):
             return Alarms(rate, found, safe is not None, healthy, healthy_needed(rate))
     return Alarms(math.nan, None, certain=False, healthy=healthy, needed=healthy_needed(RATE))
@@ -235,18 +233,15 @@ def _detection(study: Study, pair: tuple[str, str]) -> Light:
     decision = found.decision
     ends = decision.interval if found.certain else decision.at_rate
     values["ends"] = ends
-    first = study.probabilities(pair[0])[0]
+    state = compliance(decision.detected, ends, DETECTION, 1.0)
     if pair[1] in study.diagnosing:
-        other = study.probabilities(pair[1])[0]
+        own, other = (study.probabilities(name)[0] for name in pair)
         classes, rate = study.results.classes, decision.guaranteed
-        difference = detection_difference(first, other, study.truth, classes, rate)
-        plain = decide(other, study.truth, classes, rate)
+        difference = detection_difference(own, other, study.truth, classes, rate)
+        plain = study.decision(pair[1], rate)
         if difference is not None:
             values["rival"] = {"difference": difference, "decision": plain, "source": pair[1]}
-    state = compliance(decision.detected, ends, DETECTION, 1.0)
-    rival = values["rival"]
-    if rival and rival["difference"][1][1] < 0:
-        state = "not met"
+            state = "not met" if difference[1][1] < 0 else state
     return Light("detection", state, values)
 
 
@@ -271,35 +266,24 @@ def _realism(study: Study, source: str) -> Light:
 
 def _noiseless(study: Study, source: str) -> list[str]:
     """The outputs at rest whose generated noise is far below the measured one."""
-    observed, predicted = (
-        study.arrays.get(f"z/{source}/{name}") for name in ("observed", "predicted")
-    )
-    fidelity = study.results.fidelity.get(source)
-    if observed is None or predicted is None or fidelity is None:
-        return []
     missing = []
-    for column, name in enumerate(fidelity.latents):
-        measured, drawn = (each[:, column] for each in (observed, predicted))
-        measured, drawn = measured[np.isfinite(measured)], drawn[np.isfinite(drawn)]
-        if not name.startswith("noise_") or not len(measured) or not len(drawn):
+    for each in study.components(source):
+        measured, drawn = (v[np.isfinite(v)] for v in (each.observed, each.predicted))
+        if not each.name.startswith("noise_") or not len(measured) or not len(drawn):
             continue
         if all(mean(drawn) < NOISELESS * mean(measured) for mean in (np.median, np.mean)):
-            missing.append(name.removeprefix("noise_"))
+            missing.append(each.name.removeprefix("noise_"))
     return missing
 
 
 def _gain(study: Study) -> str:
     """Whether a diagnoser trained on the updated twin is better than one on the plain twin."""
     pair = headline(study.results)
-    found = study.results.compared(*pair) if pair else {}
-    directed = [name for name, each in METRICS.items() if each.better and name in found]
-    metric = next((name for name in directed if found[name].interval is not None), None)
-    if metric is None:
+    each = decisive(study.results.compared(*pair)) if pair else None
+    if each is None or each.interval is None:
         return "not measured"
-    each, better = found[metric], METRICS[metric].better
-    ends = each.interval
-    assert ends is not None
-    ends = ends if better > 0 else (-ends[1], -ends[0])
+    better = METRICS[each.metric].better
+    ends = each.interval if better > 0 else (-each.interval[1], -each.interval[0])
     if study.results.runs < MIN_RUNS and ends[1] > 0:
         return "undecided"  # the interval does not contain the randomness of training
     return compliance(better * each.mean_diff, ends, np.nextafter(0.0, 1.0))
@@ -309,13 +293,9 @@ def better_alternatives(study: Study, found: Alarms | None, source: str) -> list
     """Other sources on comparable data that detect more at the same rate, the best one first."""
     if found is None or found.decision is None:
         return []
-    results, rate = study.results, found.decision.guaranteed
-    others = []
-    for name in study.diagnosing:
-        if name == source or results.sources[name].real_data in ("transductive", "labelled"):
-            continue
-        first = study.probabilities(name)[0]
-        decision = decide(first, study.truth, results.classes, rate)
-        if decision.detected > found.decision.detected:
-            others.append({"source": name, "title": source_name(name), "decision": decision})
-    return sorted(others, key=lambda each: -each["decision"].detected)
+    rate, unlike = found.decision.guaranteed, ("transductive", "labelled")
+    names = [n for n in study.diagnosing if study.results.sources[n].real_data not in unlike]
+    known = {name: study.decision(name, rate) for name in names if name != source}
+    better = {name: each for name, each in known.items() if each.detected > found.decision.detected}
+    ranked = sorted(better.items(), key=lambda pair: -pair[1].detected)
+    return [{"source": name, "decision": each} for name, each in ranked]

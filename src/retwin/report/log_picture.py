@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Sequence
-
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from retwin.arrays import runs
 from retwin.data.logs.mapped import Parts
 from retwin.data.logs.signals import Log
-from retwin.report.png import blank, dress
-from retwin.report.style import PALETTE, hexadecimal
+from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, Spans
+from retwin.report.labels import counted
+from retwin.report.png import png
 
 MAX_ROWS = 16
 """Signals that are drawn at most."""
-POINTS = 3000
-"""Points of a line from which it is drawn by the extremes of its parts."""
-COMMAND, OUTPUT = PALETTE[1][0], PALETTE[0][0]
+COMMAND, OUTPUT = "c1", "c0"
+KEYS = (
+    Key("value of the log", "observed"),
+    Key("command of a trajectory", COMMAND),
+    Key("output of a trajectory", OUTPUT),
+    Key("missing samples", "stop", "bar"),
+)
 
 
-@rc_context({"text.parse_math": False})  # a name with $ is no formula
 def log_picture(log: Log, tried: Parts | str) -> bytes:
     """The signals of a log as PNG, above each other, with the trajectories that a mapping makes.
 
@@ -41,104 +36,53 @@ def log_picture(log: Log, tried: Parts | str) -> bytes:
         The trajectories; or why there are none, and the first signals are drawn alone.
 
     """
-    parts, reason = (None, tried) if isinstance(tried, str) else (tried, "")
-    rows: list[tuple[str, str, int | None]] = []
-    if parts is not None:
-        kinds = [COMMAND] * len(parts.commands) + [OUTPUT] * (
-            len(parts.every) - len(parts.commands)
-        )
-        names = [f"{each.name} [{each.unit}]" for each in parts.every]
-        rows = [(name, kind, i) for i, (name, kind) in enumerate(zip(names, kinds, strict=True))]
+    if isinstance(tried, str):
+        title = f"signals alone; {tried}"
+        names = list(log.signals)
+        marks: list[list[Mark]] = [
+            [Line(each.times, each.values, each.name, OUTPUT, width=1.1)]
+            for each in list(log.signals.values())[:MAX_ROWS]
+        ]
     else:
-        rows = [(name, OUTPUT, None) for name in log.signals]
-    left, rows = len(rows) - MAX_ROWS, rows[:MAX_ROWS]
-    canvas = blank(11, 1.2 + 1.1 * len(rows))
-    every = np.atleast_1d(canvas.subplots(len(rows), 1, sharex=True))
-    names = list(log.signals)
-    for place, (axes, (title, colour, column)) in enumerate(zip(every, rows, strict=True)):
-        dress(axes, "", "")
-        # Above the line and not beside it: names of signals are long.
-        axes.set_title(title, loc="left", fontsize=9, color=hexadecimal("ink"), pad=3)
-        if parts is None or column is None:
-            signal = log.signals[names[place]]
-            axes.plot(*_thinned(signal.times, signal.values), color=colour, linewidth=0.9)
-        else:
-            _row(axes, parts, column, colour)
-    every[-1].set_xlabel("time since the first value of the log, s", color=hexadecimal("muted"))
-    _legend(canvas, every[0], parts, log, reason, left)
-    canvas.set_dpi(110)
-    drawn = FigureCanvasAgg(canvas)
-    file = io.BytesIO()
-    drawn.print_png(file, metadata={"Software": None})
-    return file.getvalue()
+        title = f"{counted(len(tried.blocks), 'trajectory')} at {tried.rate:g} Hz"
+        names = [f"{each.name} [{each.unit}]" for each in tried.every]
+        marks = [_marks(tried, column) for column in range(min(len(names), MAX_ROWS))]
+    if len(names) > MAX_ROWS:
+        title += f"; {len(names) - MAX_ROWS} more signals are not drawn"
+    limits = (-0.02 * log.end, max(1.02 * log.end, 1e-9))
+    last = Axis("time since the first value of the log", "s", limits)
+    panels = [
+        # Names above the lines and not beside them, since they are long.
+        Panel(
+            last if place == len(marks) - 1 else Axis("", "", limits, bare=True),
+            [Row(Axis("", count=3), row)],
+            name,
+            name,
+            height=125,
+        )
+        for place, (name, row) in enumerate(zip(names, marks, strict=False))
+    ]
+    title = f"{log.name}: {title}"
+    title = title if len(title) < 100 else title[:99] + "…"
+    keys = () if isinstance(tried, str) else KEYS
+    return png(Figure("log", panels, keys, columns=1, title=title), emulated=False)
 
 
-def _row(axes: Axes, parts: Parts, column: int, colour: str) -> None:
-    channel = parts.every[column]
+def _marks(parts: Parts, column: int) -> list[Mark]:
+    """The values of a channel, and what trajectories have of them."""
+    channel, colour = parts.every[column], COMMAND if column < len(parts.commands) else OUTPUT
     known = np.isfinite(channel.signal.values)
     times, values = channel.signal.times[known], channel.signal.values[known]
-    pauses = np.flatnonzero(np.diff(times) > channel.longest)  # no line leads over them
-    axes.plot(
-        *_thinned(
-            np.insert(times, pauses + 1, times[pauses]), np.insert(values, pauses + 1, np.nan)
-        ),
-        color=hexadecimal("observed"),
-        linewidth=0.8,
-        alpha=0.7,
-    )
-    ends = []
+    pauses = np.flatnonzero(np.diff(times) > channel.longest) + 1  # no line leads over them
+    x, y = np.insert(times, pauses, times[pauses - 1]), np.insert(values, pauses, np.nan)
+    marks: list[Mark] = [Line(x, y, "value of the log", "observed", width=1, alpha=0.7)]
     for start, block in parts.blocks:
         grid = start + np.arange(len(block)) / parts.rate
-        axes.axvspan(grid[0], grid[-1], color=colour, alpha=0.07, linewidth=0)
-        ends += [grid[0], grid[-1]]
-        axes.plot(*_thinned(grid, block[:, column]), color=colour, linewidth=1.1)
-        for first, last in runs(~np.isfinite(block[:, column])) - [0, 1]:
-            axes.axvspan(grid[first], grid[last], 0, 0.06, color=hexadecimal("stop"), linewidth=0.8)
-    for each in ends[:400]:
-        axes.axvline(each, color=colour, linewidth=0.6, alpha=0.5)
-
-
-def _thinned(times: NDArray, values: NDArray) -> tuple[NDArray, NDArray]:
-    """A line of at most some thousand points, which keeps the extremes."""
-    if len(times) <= POINTS:
-        return times, values
-    parts = np.array_split(np.arange(len(times)), POINTS // 2)
-    kept: list[int] = []
-    for part in parts:
-        own = values[part]
-        missing = ~np.isfinite(own)
-        ends = part[missing][:1].tolist()  # a hole stays one
-        if not missing.all():
-            ends += [int(part[np.nanargmin(own)]), int(part[np.nanargmax(own)])]
-        kept += sorted(set(ends))
-    return times[kept], values[kept]
-
-
-def _legend(
-    canvas: object, axes: Axes, parts: Parts | None, log: Log, reason: str, left: int
-) -> None:
-    title = f"{log.name}: "
-    handles: Sequence[Line2D | Patch] = ()
-    if parts is None:
-        title += f"signals alone; {reason}"
-    else:
-        count = len(parts.blocks)
-        title += f"{count} {'trajectory' if count == 1 else 'trajectories'} at {parts.rate:g} Hz"
-        handles = [
-            Line2D([], [], color=hexadecimal("observed"), label="value of the log"),
-            Line2D([], [], color=COMMAND, label="command of a trajectory"),
-            Line2D([], [], color=OUTPUT, label="output of a trajectory"),
-            Patch(color=hexadecimal("stop"), label="missing samples"),
+        holes = runs(~np.isfinite(block[:, column])) - [0, 1]
+        missing = [(float(grid[first]), float(grid[end])) for first, end in holes]
+        marks += [
+            Spans([(float(grid[0]), float(grid[-1]))], colour, alpha=0.07, outline=0.6),
+            Line(grid, block[:, column], "trajectory", colour, width=1.4),
+            Spans(missing, "stop", height=0.08, outline=0.8),
         ]
-    if left > 0:
-        title += f"; {left} more signals are not drawn"
-    canvas.suptitle(title if len(title) < 160 else title[:159] + "…", fontsize=10)  # type: ignore[attr-defined]
-    if handles:
-        axes.legend(
-            handles=handles,
-            loc="lower right",
-            bbox_to_anchor=(1.0, 1.02),
-            ncols=4,
-            fontsize=8,
-            frameon=False,
-        )
+    return marks

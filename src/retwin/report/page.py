@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from markupsafe import Markup
 
 from retwin.report import labels
-from retwin.report.assets import asset, environment, plotly_js, script_json
+from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Section
 from retwin.report.glossary import explained
 from retwin.report.lights import RATE
-from retwin.report.plotly_specs import figure_specs
 from retwin.report.png import png, small
 from retwin.report.sections import sections_of
 from retwin.report.study import Study, read_study
@@ -53,17 +52,6 @@ PAGES = "https://retwin.readthedocs.io/en/latest/"
 """The documentation."""
 DOCS = f"{PAGES}report.html"
 """The documentation of the page, to which each section links."""
-NAMED: tuple[Callable[..., str], ...] = (labels.class_name, labels.counted, labels.duration)
-NAMED += (labels.in_sentence, labels.mean_and_deviation, labels.number, labels.percent)
-NAMED += (labels.percents, labels.reason, labels.sentence, labels.signed, labels.span)
-NAMED += (labels.source_in_sentence, labels.source_name, labels.times)
-"""Filters of templates under their own names."""
-FILTERS = {each.__name__: each for each in NAMED} | {
-    "metric": labels.metric_name,
-    "outcome": outcome_of,
-    "places": lambda values: labels.places(*values),
-}
-"""What templates apply to values; see `retwin.report.labels`."""
 
 
 def write_report(folder: str | os.PathLike[str]) -> Path:
@@ -110,12 +98,17 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
 
 def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes]) -> str:
     """The page as text; `images` take the place of the figures where scripts do not run."""
-    units, templates = study.results.outputs.units, environment()
-    templates.filters |= FILTERS | {
+    units = study.results.outputs.units
+    shown = {name: small(data) for name, data in images.items()}
+    templates = environment(emulated=study.results.emulated, images=shown)
+    templates.filters |= {
+        "outcome_of": outcome_of,
         "scored": lambda value, metric: labels.scored(value, metric, units),
         "difference": lambda each: labels.difference(each, units)[0],
         "interval": lambda each: labels.difference(each, units)[1],
     }
+    found = summary(study)
+    front = [found["figure"]] if found and found["figure"] else []
     templates.globals |= {
         "results": study.results,
         "word": study.word,
@@ -123,40 +116,24 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "min_runs": MIN_RUNS,
         "min_records": MIN_RECORDS,
         "anchors": {section.key for section in sections},
-        "images": {name: base64.b64encode(small(data)).decode() for name, data in images.items()},
         "rate": RATE,
         "docs": DOCS,
         "corrections": f"{PAGES}corrections.html",
         "monitor": f"{PAGES}monitor.html",
+        "verdict": verdict(study),
     }
-    bodies = {
-        section.key: _dressed(
-            templates.get_template(f"{section.key}.html.j2").render(section.values)
-        )
-        for section in sections
-    }
-    found = summary(study)
-    front = [found["figure"]] if found and found["figure"] else []
-    verdicts = verdict(study)
-    first = (
-        templates.get_template("summary.html.j2").render(summary=found, verdict=verdicts)
-        if found
-        else ""
-    )
-    specs = figure_specs([*front, *(figure for each in sections for figure in each.figures)])
-    contents = {name: value for each in sections for name, value in each.scripts.items()}
-    return templates.get_template("page.html.j2").render(
+
+    def filled(name: str, values: Mapping[str, Any]) -> Markup:
+        """A part with its terms explained, and no line break before a percent sign."""
+        text = templates.get_template(f"{name}.html.j2").render(values)
+        return Markup(re.sub(r"(?<=\d) (?=%)", "\u00a0", explained(text)))
+
+    return render_page(
+        templates,
+        "page",
+        [*front, *(figure for each in sections for figure in each.figures)],
         sections=sections,
-        bodies=bodies,
-        verdict=verdicts,
-        summary=_dressed(first),
-        specs=script_json(specs),
-        contents={name: script_json(content) for name, content in contents.items()},
-        scripts={name: asset(f"{name}.js") for name in contents},
-        plotly=plotly_js() if specs or "explorer" in contents else "",
+        bodies={section.key: filled(section.key, section.values) for section in sections},
+        summary=filled("summary", {"summary": found}) if found else "",
+        scripts={name: value for each in sections for name, value in each.scripts.items()},
     )
-
-
-def _dressed(markup: str) -> Markup:
-    """HTML with its terms explained, and no line break between a number and its percent sign."""
-    return Markup(re.sub(r"(?<=\d) (?=%)", "\u00a0", explained(markup)))

@@ -20,7 +20,6 @@ from PIL import Image
 from retwin.report.figure import (
     Axis,
     Band,
-    Bars,
     Dimension,
     Figure,
     Heading,
@@ -48,6 +47,8 @@ def png(shown: Figure | Matrices, *, emulated: bool) -> bytes:
     if emulated:
         heading = "EMULATED data: no real measurements"
         canvas.suptitle(heading, color=hexadecimal("alarm"), fontsize=10)
+    elif isinstance(shown, Figure):
+        canvas.suptitle(shown.title, color=hexadecimal("ink"), fontsize=10)
     canvas.set_dpi(160)
     drawn = FigureCanvasAgg(canvas)
     drawn.draw()
@@ -117,7 +118,7 @@ def _figure(figure: Figure) -> Canvas:
 
 def _panel(axes: Axes, panel: Panel, row: Row, *, last: bool) -> None:
     dress(axes, panel.x.title if last else "", row.y.title)
-    for mark in row.marks:
+    for mark in row.drawn:
         _mark(axes, mark)
     _scale(axes, panel.x, "x")
     _scale(axes, row.y, "y")
@@ -140,6 +141,8 @@ def _scale(axes: Axes, axis: Axis, which: Literal["x", "y"]) -> None:
     if axis.kind == "names":
         axes.grid(visible=False, axis=which)
         axes.tick_params(axis=which, length=0, labelcolor=hexadecimal("ink"))
+    if axis.bare:
+        axes.tick_params(axis=which, labelbottom=False, labelleft=False)
     if axis.limits is not None:
         limit(*axis.limits)
     elif axis.from_zero:
@@ -147,82 +150,44 @@ def _scale(axes: Axes, axis: Axis, which: Literal["x", "y"]) -> None:
 
 
 def _mark(axes: Axes, mark: Mark) -> None:
+    look: dict[str, Any] = {
+        "color": hexadecimal("ink" if isinstance(mark, Heading) else mark.colour)
+    }
     match mark:
+        case Line(filled=True):
+            axes.fill_between(mark.x, mark.y, linewidth=0, **look)
         case Line():
-            axes.plot(
-                mark.x,
-                mark.y,
-                color=hexadecimal(mark.colour),
-                linestyle=STYLES[mark.dash],
-                linewidth=0.8 * mark.width,
-                alpha=mark.alpha,
-                drawstyle="steps-post" if mark.step else "default",
-            )
+            look |= {"alpha": mark.alpha, "linestyle": STYLES[mark.dash]}
+            axes.plot(mark.x, mark.y, linewidth=0.8 * mark.width, **look)
         case Band():
-            fill: dict[str, Any] = {
-                "color": hexadecimal(mark.colour),
-                "alpha": mark.alpha,
-                "linewidth": 0,
-            }
-            axes.fill_between(mark.x, mark.low, mark.high, **fill)
+            axes.fill_between(mark.x, mark.low, mark.high, alpha=mark.alpha, linewidth=0, **look)
         case Points():
-            _points(axes, mark)
-        case Bars():
-            width = np.diff(mark.edges)
-            axes.bar(
-                mark.edges[:-1], mark.heights, width, align="edge", color=hexadecimal(mark.colour)
-            )
+            look |= {"elinewidth": 0.8 * mark.bar_width, "markersize": 0.6 * mark.size}
+            look |= {f"{mark.along}err": mark.intervals} | _symbol(mark.symbol, look["color"])
+            axes.errorbar(mark.x, mark.y, linestyle=STYLES.get(mark.dash, "none"), **look)
         case Spans():
+            area = {"facecolor": (look["color"], mark.alpha), "edgecolor": look["color"]}
             for start, end in mark.intervals:
-                axes.axvspan(start, end, color=hexadecimal(mark.colour), linewidth=0, zorder=0)
+                axes.axvspan(start, end, 0, mark.height, linewidth=mark.outline, zorder=0, **area)
         case Dimension():
-            ends = zip(mark.start, mark.end, strict=True)
-            axes.plot(*ends, color=hexadecimal(mark.colour), linewidth=3)
+            axes.plot(*zip(mark.start, mark.end, strict=True), linewidth=3, **look)
         case Heading():
-            place: dict[str, Any] = {
-                "transform": axes.get_yaxis_transform(),
-                "va": "center",
-                "fontsize": 9,
-            }
-            axes.text(0.01, mark.y, mark.text, **place, weight="bold", color=hexadecimal("ink"))
+            look |= {"transform": axes.get_yaxis_transform(), "va": "center", "weight": "bold"}
+            axes.text(0.01, mark.y, mark.text, fontsize=9, **look)
 
 
-def _points(axes: Axes, mark: Points) -> None:
-    colour = hexadecimal(mark.colour)
-    x, y = (np.asarray(each, dtype=float) for each in (mark.x, mark.y))
-    errors: dict[str, Any] = {}
-    if mark.low is not None and mark.high is not None:
-        middle = x if mark.along == "x" else y
-        ends = [middle - np.asarray(mark.low), np.asarray(mark.high) - middle]
-        errors = {f"{mark.along}err": np.maximum(ends, 0)}
-    axes.errorbar(
-        x,
-        y,
-        **errors,
-        color=colour,
-        fmt=SYMBOLS[mark.symbol],
-        markersize=0.6 * mark.size,
-        markerfacecolor="white" if mark.symbol.endswith("-open") else colour,
-        linestyle=STYLES[mark.dash] if mark.dash else "none",
-        elinewidth=0.8 * mark.bar_width,
-    )
+def _symbol(name: str, colour: str) -> dict[str, str]:
+    filled = "white" if name.endswith("-open") else colour
+    return {"marker": SYMBOLS[name], "markerfacecolor": filled}
 
 
 def _handle(key: Key) -> Line2D | Patch:
-    colour = hexadecimal(key.colour)
+    look: dict[str, Any] = {"color": hexadecimal(key.colour), "label": key.text}
     if key.mark == "bar":
-        return Patch(
-            color=colour, alpha=1 if key.colour in CHROME else 0.4, linewidth=0, label=key.text
-        )
+        return Patch(alpha=1 if key.colour in CHROME else 0.4, linewidth=0, **look)
     if key.mark in SYMBOLS:
-        fill = "white" if key.mark.endswith("-open") else colour
-        look: dict[str, Any] = {
-            "marker": SYMBOLS[key.mark],
-            "markerfacecolor": fill,
-            "linestyle": "none",
-        }
-        return Line2D([], [], color=colour, label=key.text, **look)
-    return Line2D([], [], color=colour, linestyle=STYLES[key.mark], label=key.text)
+        look |= _symbol(key.mark, look["color"])
+    return Line2D([], [], linestyle=STYLES.get(key.mark, "none"), **look)
 
 
 def _matrices(shown: Matrices) -> Canvas:

@@ -102,7 +102,7 @@ def spectrum_panel(errors: Errors, rate: float) -> Panel | None:
     marks: list[Mark] = [Line(frequencies, np.sqrt(signal), "measured", "ink", width=1.4)]
     for key, each in zip(errors.by_key, others, strict=True):
         marks.append(line(frequencies, np.sqrt(each), key))
-    unit = f"{output.unit}/√Hz" if output.unit else "1/√Hz"
+    unit = f"{output.unit or 1}/√Hz"
     return Panel(
         log_axis("frequency", "Hz", frequencies),
         [Row(log_axis("spectral density", unit, np.sqrt([signal, *others])), marks)],

@@ -14,13 +14,27 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY
 from retwin.errors import InputError
-from retwin.report.labels import order
-from retwin.results import Results, read_results
+from retwin.report.labels import order, quantities
+from retwin.results import FidelityResults, Results, read_results
+from retwin.scores.decisions import Decision, decide
 from retwin.source_results import SourceResults
 
 AGAIN = "run `retwin study` with this folder as --out again"
 BANDS = ("nominal", "observed", "seen", "quantiles", "ids", "rate")
 """The arrays `bands/SOURCE/…`."""
+
+Shape = tuple[int | None, ...]
+"""The shape of an array; None stands for any length."""
+
+
+@dataclass(frozen=True)
+class Component:
+    """A component of z: its values, measured (n,) and generated (m,), in the unit that is shown."""
+
+    name: str
+    unit: str
+    observed: NDArray
+    predicted: NDArray
 
 
 @dataclass(frozen=True)
@@ -45,15 +59,20 @@ class Study:
     arrays: Mapping[str, NDArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        n, classes = len(self.results.data.test.labels), len(self.results.classes)
         for name in self.results.sources:
-            shape = (None, len(self.results.data.test.labels), len(self.results.classes))
-            self._require(f"probabilities/{name}", shape)
-        for name in self.results.fidelity:
-            self._check_fidelity(name)
+            self._require(f"probabilities/{name}", (None, n, classes))
+        for name, fidelity in self.results.fidelity.items():
+            self._require_all(_fidelity_shapes(name, fidelity, self.arrays, self.bands(name)))
         self._check_overlay()
-        self._check_simulations()
+        if "simulation/observed" in self.arrays:
+            self._check_simulations()
 
-    def _require(self, name: str, shape: tuple[int | None, ...], *, needed: bool = False) -> None:
+    def _require_all(self, shapes: Mapping[str, Shape], *, needed: bool = False) -> None:
+        for name, shape in shapes.items():
+            self._require(name, shape, needed=needed)
+
+    def _require(self, name: str, shape: Shape, *, needed: bool = False) -> None:
         """The array must have that shape, in which None stands for any length."""
         found = self.arrays.get(name)
         if found is None and not needed:
@@ -71,24 +90,6 @@ class Study:
             remedy=AGAIN,
         )
 
-    def _check_fidelity(self, source: str) -> None:
-        fidelity = self.results.fidelity[source]
-        for name in ("observed", "predicted"):
-            self._require(f"z/{source}/{name}", (None, len(fidelity.latents)))
-        observed = self.arrays.get(f"z/{source}/observed")
-        if observed is not None:
-            self._require(f"z/{source}/trajectory", (len(observed),))
-        self._require(f"pit/{source}", (3, None))
-        parts = self.bands(source)
-        if parts:
-            count, samples = parts["seen"].shape
-            full = (count, samples, len(fidelity.outputs))
-            for name in ("nominal", "observed"):
-                self._require(f"bands/{source}/{name}", full)
-            self._require(f"bands/{source}/quantiles", (count, 5, *full[1:]))
-            self._require(f"bands/{source}/ids", (count,))
-            self._require(f"bands/{source}/rate", ())
-
     def _check_overlay(self) -> None:
         overlay, bands = self.results.overlay, self.arrays.get("portrait/bands")
         if overlay is None or bands is None:
@@ -103,48 +104,42 @@ class Study:
             remedy=AGAIN,
         )
         samples, latents = bands.shape[2], len(overlay.latents)
-        shapes: dict[str, tuple[int | None, ...]] = {
+        values, chains = (n, samples, outputs), (n, samples, None, 3)
+        shapes: dict[str, Shape] = {
             "portrait/commands": (n, samples, len(self.results.inputs.names)),
-            "portrait/nominal": (n, samples, outputs),
-            "portrait/observed": (n, samples, outputs),
-            "portrait/z": (n, None, latents),
-            "portrait/deviation": (n, None, latents),
+            **dict.fromkeys(("portrait/nominal", "portrait/observed"), values),
+            **dict.fromkeys(("portrait/z", "portrait/deviation"), (n, None, latents)),
             "portrait/times": (n, None, 3),
             "portrait/rate": (),
         }
         if "pose/nominal" in self.arrays:
-            shapes |= dict.fromkeys(("pose/nominal", "pose/observed"), (n, samples, None, 3))
+            shapes |= dict.fromkeys(("pose/nominal", "pose/observed"), chains)
         if "pose/updated" in self.arrays:
-            shapes["pose/updated"] = (n, samples, None, 3)
-        for name, shape in shapes.items():
-            self._require(name, shape, needed=True)
+            shapes["pose/updated"] = chains
+        self._require_all(shapes, needed=True)
 
     def _check_simulations(self) -> None:
-        observed = self.arrays.get("simulation/observed")
-        if observed is None:
-            return
-        full = observed.shape
+        arrays = self.arrays
         self._require("simulation/observed", (None, None, None))
-        self._require("simulation/ids", full[:1], needed=True)
-        self._require("simulation/rate", (), needed=True)
+        full = arrays["simulation/observed"].shape
+        self._require_all({"simulation/ids": full[:1], "simulation/rate": ()}, needed=True)
         for name in self.results.sources:
             self._require(f"simulation/{name}/mean", full)
             self._require(f"simulation/{name}/bands", (full[0], 5, *full[1:]))
-        commands = self.arrays.get("simulation/commands")
-        if commands is not None:
+        if "simulation/commands" in arrays:
             self._require("simulation/commands", (*full[:2], None))
-            self._require("simulation/range", (2, commands.shape[2] + full[2]))
-        values = self.arrays.get("delta/values")
-        if values is not None:
+            channels = arrays["simulation/commands"].shape[2] + full[2]
+            self._require("simulation/range", (2, channels))
+        if "delta/values" in arrays:
             self._require("delta/values", (None, None))
-            for name in ("discrepancy", "deviation"):
-                self._require(f"delta/{name}", values.shape, needed=True)
-            self._require("delta/range", (len(values), 2), needed=True)
-            self._require("delta/about", (len(values), 4), needed=True)
-        parameters = self.arrays.get("delta/parameters")
-        if parameters is not None:
+            size = arrays["delta/values"].shape
+            same = dict.fromkeys(("delta/discrepancy", "delta/deviation"), size)
+            about: dict[str, Shape] = {"delta/range": (size[0], 2), "delta/about": (size[0], 4)}
+            self._require_all(same | about, needed=True)
+        if "delta/parameters" in arrays:
             self._require("delta/parameters", (None, 3))
-            self._require("delta/estimates", (len(parameters), 4), needed=True)
+            count = len(arrays["delta/parameters"])
+            self._require("delta/estimates", (count, 4), needed=True)
 
     @property
     def sources(self) -> dict[str, SourceResults]:
@@ -172,10 +167,17 @@ class Study:
         return labels == HEALTHY
 
     @property
-    def output_units(self) -> list[str]:
-        """The unit of every output, "" where none is stated."""
-        names, units = self.results.outputs.names, self.results.outputs.units
-        return [*units[: len(names)], *[""] * (len(names) - len(units))]
+    def output_quantities(self) -> list[tuple[float, str]]:
+        """Factor and unit in which each output is shown."""
+        return quantities(self.results.outputs.units, len(self.results.outputs.names))
+
+    @property
+    def portrait(self) -> dict[str, NDArray]:
+        """The arrays `portrait/…` by the last part of the name; empty without predictions."""
+        known = {
+            name.split("/")[1]: each for name, each in self.arrays.items() if "portrait/" in name
+        }
+        return known if self.results.overlay is not None and "bands" in known else {}
 
     @property
     def diagnosing(self) -> list[str]:
@@ -186,18 +188,55 @@ class Study:
     @property
     def explorable(self) -> bool:
         """Whether there is what the explorer shows."""
-        known = self.results.overlay is not None and "portrait/bands" in self.arrays
-        return known and bool(self.results.data.test.ids)
+        return bool(self.portrait and self.results.data.test.ids)
 
     def probabilities(self, source: str) -> NDArray:
         """Probabilities of shape (runs, n, classes); empty if there are none."""
         return self.arrays.get(f"probabilities/{source}", np.empty(0))
+
+    def decision(self, source: str, rate: float) -> Decision:
+        """The decision at a false-alarm rate of the first run: a threshold belongs to one model."""
+        return decide(self.probabilities(source)[0], self.truth, self.results.classes, rate)
 
     def bands(self, source: str) -> dict[str, NDArray]:
         """The arrays `bands/SOURCE/…` by the last part of the name; empty if one is missing."""
         found = {name: self.arrays.get(f"bands/{source}/{name}") for name in BANDS}
         known = {name: each for name, each in found.items() if each is not None}
         return known if len(known) == len(BANDS) and known["seen"].ndim == 2 else {}
+
+    def components(self, source: str) -> list[Component]:
+        """The components of z of a source; none without measured and generated values."""
+        both = [self.arrays.get(f"z/{source}/{name}") for name in ("observed", "predicted")]
+        fidelity = self.results.fidelity.get(source)
+        if fidelity is None or any(each is None for each in both):
+            return []
+        units = quantities(fidelity.latent_units, len(fidelity.latents))
+        return [
+            Component(name, unit, *(factor * each[:, i] for each in both if each is not None))
+            for i, (name, (factor, unit)) in enumerate(zip(fidelity.latents, units, strict=True))
+        ]
+
+
+def _fidelity_shapes(
+    source: str,
+    fidelity: FidelityResults,
+    arrays: Mapping[str, NDArray],
+    bands: Mapping[str, NDArray],
+) -> dict[str, Shape]:
+    """The shapes of the arrays on the draws of a source."""
+    z, latents = arrays.get(f"z/{source}/observed"), len(fidelity.latents)
+    both = f"z/{source}/observed", f"z/{source}/predicted"
+    shapes: dict[str, Shape] = dict.fromkeys(both, (None, latents))
+    if z is not None:
+        shapes[f"z/{source}/trajectory"] = z.shape[:1]
+    shapes[f"pit/{source}"] = (3, None)
+    if bands:
+        count, samples = bands["seen"].shape
+        full = (samples, len(fidelity.outputs))
+        sizes = {"nominal": full, "observed": full, "quantiles": (5, *full), "ids": ()}
+        shapes |= {f"bands/{source}/{name}": (count, *rest) for name, rest in sizes.items()}
+        shapes[f"bands/{source}/rate"] = ()
+    return shapes
 
 
 def read_study(folder: str | os.PathLike[str]) -> Study:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.report.blocks import Cell, Table, columns
-from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row, draw_bands
+from retwin.report.blocks import Table, tabulate
+from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, bar, draw_bands
 from retwin.report.labels import (
+    behind,
     in_sentence,
     latent_names,
     learned_name,
@@ -20,7 +21,7 @@ from retwin.report.labels import (
     percent,
     percents,
     places,
-    quantity,
+    quantities,
     source_name,
     span,
 )
@@ -99,20 +100,17 @@ def learned(study: Study) -> Table | None:
         # Of a component that both have, the one that more segments identify.
         if name not in rows or row.count > rows[name].count:
             rows[name] = row
-    names = "Mean", "95 % interval", "Range of 90 % of the segments", "Generated mean", "Segments"
+    heads = ["Quantity", "Mean", "95 % interval", "Range of 90 % of the segments"]
+    heads += ["Generated mean", "Segments"]
     cells = [row.cells for row in rows.values()]
-    return (
-        Table("What was learned", columns("Quantity", *names), cells).without_empty()
-        if rows
-        else None
-    )
+    return tabulate("What was learned", heads, cells).without_empty() if rows else None
 
 
 @dataclass(frozen=True)
 class _Row:
     """A row of the table, and the number of segments that identify it."""
 
-    cells: list[Cell]
+    cells: list[str]
     count: int
 
 
@@ -121,10 +119,9 @@ def _segment_rows(study: Study) -> list[tuple[str, _Row]]:
     overlay, values = study.results.overlay, study.arrays.get("portrait/z")
     if overlay is None or values is None or not study.healthy.any():
         return []
-    units = [*overlay.latent_units, *[""] * len(overlay.latents)]
+    units = quantities(overlay.latent_units, len(overlay.latents))
     rows = []
-    for column, name in enumerate(overlay.latents):
-        factor, unit = quantity(units[column])
+    for column, (name, (factor, unit)) in enumerate(zip(overlay.latents, units, strict=True)):
         row = _row(name, unit, factor * values[study.healthy, :, column].astype(float))
         rows += [(name, row)] if row else []
     return rows
@@ -136,28 +133,21 @@ def _held_out_rows(study: Study) -> list[tuple[str, _Row]]:
     Offsets too, where no others are known from every test trajectory.
     """
     pair = headline(study.results)
-    fidelity = study.results.fidelity.get(pair[0]) if pair else None
-    if pair is None or fidelity is None:
+    if pair is None:
         return []
-    observed, predicted, owner = (
-        study.arrays.get(f"z/{pair[0]}/{name}") for name in ("observed", "predicted", "trajectory")
-    )
-    if observed is None or predicted is None:
-        return []
-    units = [*fidelity.latent_units, *[""] * len(fidelity.latents)]
+    owner = study.arrays.get(f"z/{pair[0]}/trajectory")
     kinds = ("noise_", "delay", *([] if study.results.overlay else ["offset_"]))
     rows = []
-    for column, name in enumerate(fidelity.latents):
-        if not name.startswith(kinds):
+    for each in study.components(pair[0]):
+        if not each.name.startswith(kinds):
             continue
-        factor, unit = quantity(units[column])
-        values, drawn = (factor * each[:, column].astype(float) for each in (observed, predicted))
+        values, drawn = each.observed.astype(float), each.predicted[np.isfinite(each.predicted)]
         groups = [values] if owner is None else [values[owner == i] for i in np.unique(owner)]
         size = max(map(len, groups))
-        padded = [np.pad(each, (0, size - len(each)), constant_values=np.nan) for each in groups]
-        drawn = drawn[np.isfinite(drawn)]
-        row = _row(name, unit, np.array(padded), float(drawn.mean()) if len(drawn) else None)
-        rows += [(name, row)] if row else []
+        padded = [np.pad(part, (0, size - len(part)), constant_values=np.nan) for part in groups]
+        mean = float(drawn.astype(float).mean()) if len(drawn) else None
+        row = _row(each.name, each.unit, np.array(padded), mean)
+        rows += [(each.name, row)] if row else []
     return rows
 
 
@@ -172,20 +162,20 @@ def _row(name: str, unit: str, values: NDArray, generated: float | None = None) 
         hits = np.nansum(values, axis=1)
         ends = grouped_share_interval(hits, counts)
         texts = [percent(float(hits.sum() / total), 1), percents(ends), "–", "–"]
-        return _Row([Cell(text) for text in (learned_name(name), *texts, str(total))], total)
+        return _Row([learned_name(name), *texts, str(total)], total)
     means = np.nanmean(values, axis=1)
     ends = jackknife_interval(lambda weights: weights @ means, len(means))
     low, high = np.quantile(single, [0.05, 0.95])
     mean = float(means.mean())
-    digits = places(max(abs(mean), abs(low), abs(high)))
-    behind = f" {unit}" if unit not in ("", "1") else ""
+    digits = places([mean, low, high])
     texts = [
-        number(mean, digits) + behind,
-        "–" if ends is None else span(ends, digits) + behind,
-        "–" if total < SEGMENTS else span((float(low), float(high)), digits) + behind,
-        "–" if generated is None else number(generated, digits) + behind,
+        number(mean, digits),
+        span(ends, digits),
+        span((low, high) if total >= SEGMENTS else None, digits),
+        number(generated, digits),
     ]
-    return _Row([Cell(text) for text in (learned_name(name), *texts, str(total))], total)
+    texts = [text if text == "–" else behind(text, unit) for text in texts]
+    return _Row([learned_name(name), *texts, str(total)], total)
 
 
 def picture(study: Study) -> Figure | None:
@@ -213,12 +203,11 @@ def picture(study: Study) -> Figure | None:
 
 def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
     """The healthy test trajectory with the median error, in the output with the largest one."""
-    overlay = study.results.overlay
-    if overlay is None or overlay.source != pair[0] or "portrait/bands" not in study.arrays:
+    overlay, portrait = study.results.overlay, study.portrait
+    if overlay is None or overlay.source != pair[0] or not portrait:
         return None
-    nominal, observed, times, bands = (
-        study.arrays[f"portrait/{name}"] for name in ("nominal", "observed", "times", "bands")
-    )
+    names = "nominal", "observed", "times", "bands"
+    nominal, observed, times, bands = (portrait[name] for name in names)
     chosen = partial(median_error_trajectory, nominal, observed, times, study.healthy)
     # Where no healthy trajectory is complete, one of which most was measured.
     place = chosen() if chosen() is not None else chosen(least=MOSTLY)
@@ -230,14 +219,11 @@ def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
     spread = measured[study.healthy].std(axis=(0, 1)).filled(0.0)
     error = np.sqrt(np.square(measured[place] - nominal[place]).mean(axis=0).filled(0.0))
     column = int(np.argmax(error / np.where(spread > 0, spread, np.inf)))
-    time = np.arange(nominal.shape[1]) / float(study.arrays["portrait/rate"])
-    return _panel(
-        (outputs.names[column], study.output_units[column]),
-        f"a typical healthy run ({study.results.data.test.ids[place]})",
-        time,
-        (nominal[place, :, column], observed[place, :, column], bands[place, :, :, column]),
-        colour_of(pair[0]),
-    )
+    time = np.arange(nominal.shape[1]) / float(portrait["rate"])
+    where = f"a typical healthy run ({study.results.data.test.ids[place]})"
+    values = nominal[place, :, column], observed[place, :, column], bands[place, :, :, column]
+    shown = outputs.names[column], *study.output_quantities[column]
+    return _panel(shown, where, time, values, colour_of(pair[0]))
 
 
 def _record(study: Study, pair: tuple[str, str]) -> Panel | None:
@@ -250,20 +236,20 @@ def _record(study: Study, pair: tuple[str, str]) -> Panel | None:
     drawn = np.tile(after, (5, 1)) if bands is None else bands[0, :, :, 0]
     outputs = study.results.outputs
     time = np.arange(len(observed)) / float(study.arrays["simulation/rate"])
-    output = (outputs.names or ["output"])[0], (outputs.units or [""])[0]
+    output = (outputs.names or ["output"])[0], *quantities(outputs.units, 1)[0]
     record = f"test record “{study.arrays['simulation/ids'][0]}”"
     return _panel(output, record, time, (before, observed, drawn), colour_of(pair[0]))
 
 
 def _panel(
-    output: tuple[str, str],
+    output: tuple[str, float, str],
     where: str,
     time: NDArray,
     values: tuple[NDArray, NDArray, NDArray],
     colour: str,
 ) -> Panel:
     """A panel of nominal and measured values (P,) and quantiles (5, P) of one output."""
-    factor, unit = quantity(output[1])
+    name, factor, unit = output
     before, measured, bands = (factor * np.asarray(each, float) for each in values)
     marks: list[Mark] = [
         *draw_bands(time, bands, colour),
@@ -274,9 +260,9 @@ def _panel(
     limits = float(time[0]), float(time[-1])
     return Panel(
         Axis("time", "s", limits),
-        [Row(Axis(output[0], unit), marks)],
-        f"{output[0]} in {where}: measured, before and after the update",
-        f"{output[0]} in {where}",
+        [Row(Axis(name, unit), marks)],
+        f"{name} in {where}: measured, before and after the update",
+        f"{name} in {where}",
         height=270,
     )
 
@@ -291,17 +277,16 @@ def _bars(study: Study, pair: tuple[str, str]) -> Panel | None:
     names = study.results.outputs.names
     if len(before) > MANY_OUTPUTS or len(before) != len(names):
         before, after, names = np.array([change.before]), np.array([change.after]), ["all outputs"]
-    centres = np.arange(len(names), dtype=float)
-    marks: list[Mark] = []
-    for values, shift, title, colour in (
-        (before, -BAR, "before", "muted"),
-        (after, 0.0, "after", colour_of(pair[0])),
-    ):
-        for centre, value in zip(centres, values, strict=True):
-            if math.isfinite(value):
-                edges = np.array([centre + shift, centre + shift + BAR])
-                marks.append(Bars(edges, np.array([value]), title, colour))
-    ticks = {float(centre): name for centre, name in zip(centres, names, strict=True)}
+    marks = [
+        bar(place + shift + np.array([0.0, BAR]), np.array([value]), title, colour)
+        for values, shift, title, colour in (
+            (before, -BAR, "before", "muted"),
+            (after, 0.0, "after", colour_of(pair[0])),
+        )
+        for place, value in enumerate(values)
+        if math.isfinite(value)
+    ]
+    ticks = {float(place): name for place, name in enumerate(names)}
     shown = "" if unit == "σ" else unit
     simulated = study.results.overlay is None
     title = "Root mean square error" if simulated else "Mean absolute error, healthy runs"

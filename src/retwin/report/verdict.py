@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from itertools import product
 from typing import Any
 
@@ -36,6 +37,12 @@ def headline(results: Results) -> tuple[str, str] | None:
     return (found[0].a, found[0].b) if found else None
 
 
+def decisive(found: Mapping[str, Comparison]) -> Comparison | None:
+    """The comparison on the first metric with an interval and a direction, if there is one."""
+    known = [found[name] for name, each in METRICS.items() if each.better and name in found]
+    return next((each for each in known if each.interval is not None), None)
+
+
 def verdict(study: Study) -> dict[str, Any] | None:
     """The values of up to three sentences; None where no interval is known.
 
@@ -49,14 +56,14 @@ def verdict(study: Study) -> dict[str, Any] | None:
     if pair is None:
         return None
     found = results.compared(*pair)
-    directed = [name for name, each in METRICS.items() if each.better and name in found]
-    metric = next((name for name in directed if found[name].interval is not None), None)
-    if metric is None:
+    first = decisive(found)
+    if first is None:
         return None
+    metric = first.metric
     alone = [results.compared(pair[0], name) for name in with_role(results.sources, "surrogate")]
     others = [each for name, each in found.items() if name in MAIN and name != metric]
     return {
-        "first": found[metric],
+        "first": first,
         "others": {
             result: [each for each in others if outcome_of(each) == result]
             for result in ("better", "worse", "open")

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import resources
+
+from jinja2 import Environment, StrictUndefined
 
 from retwin.data.io.assembly import DataCase
 from retwin.data.logs.mapping import Mapping
@@ -13,7 +16,6 @@ from retwin.serialisation.configs import toml_text
 
 MAX_LISTED = 200
 """Signals that are listed in comments."""
-SCHEMA = "https://retwin.readthedocs.io/mapping.schema.json"
 
 
 @dataclass(frozen=True)
@@ -89,48 +91,31 @@ def mapping_text(
         The median time in s from the header stamps of messages to their recording, if known.
 
     """
-    cut, time = draft.cut, draft.time
-    lines = [f"#:schema {SCHEMA}", f"# Proposed for {_comment(log.name)}; check it.", ""]
-    lines += [
-        f"rate = {draft.rate!r} # Hz",
-        'label = "" # class of all trajectories, such as "Healthy"',
-    ]
-    lines += ["", "[time]"]
+    time = draft.time
     column = time.column or next((n for n, why in log.skipped.items() if why == TIMES), "")
-    given = {**time.model_dump(exclude_defaults=True), **({"column": column} if column else {})}
-    lines += [f"{key} = {_value(value)}" for key, value in given.items()]
-    if delay is not None:
-        lines.append(f"# messages were recorded {delay:.3g} s after their header stamps (median)")
-    lines += ["", "[cut]", f"by = {toml_text(cut.by)} # none, gap, trigger or length"]
-    lines += [f"gap = {cut.gap!r} # s"] if cut.gap else []
-    for table in chosen:
-        for name, fact in chosen[table].items():
-            lines += ["", f"[{table}.{toml_text(name)}]"]
-            if fact is None:
-                # The outputs that a mapping lacks are not compared by identify.
-                more = ", or delete this table" if _spare(case, table) else ""
-                lines += [f'signal = "" # none that changes has such a name: see below{more}']
-                lines += _units_wanted(name, "", case)
-                continue
-            own = getattr(draft, table)[name]
-            lines += [f"# {_seen(fact)}", f"signal = {toml_text(fact.name)}"]
-            lines += _units_wanted(name, fact.unit, case)
-            lines += [
-                f"resample = {toml_text(own.resample or '')}",
-                f"max_gap = {own.max_gap!r} # s",
-            ]
     used = {fact.name for table in chosen.values() for fact in table.values() if fact}
-    rest = [each for each in facts if each.name not in used]
-    if rest or log.skipped:
-        lines += ["", "# Not mapped:"]
-    for each in rest[:MAX_LISTED]:
-        what = f"constant, {each.low:g}" if each.constant and each.count else _seen(each)
-        lines.append(f"#   {_comment(toml_text(each.name))}: {what}")
-    others = [(n, why) for n, why in log.skipped.items() if why not in (TIMES, NO_STAMP)]
-    lines += [f"#   {_comment(toml_text(n))}: {_comment(why)}" for n, why in others[:MAX_LISTED]]
-    left = max(0, len(rest) - MAX_LISTED) + max(0, len(others) - MAX_LISTED)
-    lines += [f"#   and {left} more"] if left else []
-    return "\n".join(lines) + "\n"
+    made = Environment(
+        undefined=StrictUndefined, autoescape=False, trim_blocks=True, lstrip_blocks=True
+    )
+    made.filters |= {"comment": _comment, "seen": _seen, "toml": _value}
+    template = resources.files(__package__).joinpath("mapping.toml.j2").read_text("utf-8")
+    text = made.from_string(template).render(
+        log=log,
+        draft=draft,
+        chosen=chosen,
+        case=case,
+        units=units_of(case),
+        # A mapping may lack the outputs of a twin without a case.
+        spare=case is not None and not case.rate,
+        time=time.model_dump(exclude_defaults=True) | ({"column": column} if column else {}),
+        delay=delay,
+        rest=[each for each in facts if each.name not in used],
+        skipped=[pair for pair in log.skipped.items() if pair[1] not in (TIMES, NO_STAMP)],
+        listed=MAX_LISTED,
+    )
+    # A line that holds a dash is an empty one; others were left by the template.
+    lines = filter(None, text.split("\n"))
+    return "\n".join("" if line == "-" else line for line in lines) + "\n"
 
 
 def units_of(case: DataCase | None) -> dict[str, str]:
@@ -138,24 +123,6 @@ def units_of(case: DataCase | None) -> dict[str, str]:
     some = () if case is None else (case.inputs, case.outputs)
     pairs = [pair for each in some for pair in zip(each.names, each.units, strict=True)]
     return {name: unit for name, unit in pairs if unit not in ("", "1")}
-
-
-def _spare(case: DataCase | None, table: str) -> bool:
-    """Whether a mapping may lack channels of a table: the outputs of a twin without a case."""
-    return table == "outputs" and case is not None and not case.rate
-
-
-def _units_wanted(channel: str, stated: str, case: DataCase | None) -> list[str]:
-    """The unit of a channel, and a comment that asks for what neither log nor case states."""
-    if case is None:
-        return [] if stated else ['# unit = "…" # the log states none']
-    unit = units_of(case).get(channel)
-    if unit is None:
-        lack = "the twin states none" if stated else "neither the log nor the twin states one"
-        return [f'# from_unit = "…" # {lack}: no conversion without', '# unit = "…" # both']
-    asked = [f'# from_unit = "…" # the log states none: taken as {_comment(unit)}']
-    # Written out, since the unit of a case is not known to a command without it.
-    return ([] if stated else asked) + [f"unit = {toml_text(unit)}"]
 
 
 def _value(value: object) -> str:

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 
-from retwin._version import __version__
 from retwin.evaluation.choice.fitted import Fitted
-from retwin.report.assets import environment, plotly_js, script_json
-from retwin.report.blocks import Cell, Table, columns
+from retwin.report.assets import environment, render_page
+from retwin.report.blocks import Table, tabulate
 from retwin.report.choice.tables import comparison_table, parameter_table, term_table, units_of
 from retwin.report.choice.texts import model_sentences
-from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
+from retwin.report.figure import Band, Figure, Key, Line, Mark, record_panel
 from retwin.report.identification.figures import OUTPUTS, SAMPLES
-from retwin.report.identification.texts import significant
-from retwin.report.labels import counted, duration
-from retwin.report.plotly_specs import figure_specs
+from retwin.report.labels import significant
 from retwin.update.forecast_errors import USUAL
 
 MEASURED, PREDICTED = "ink", "c0"
@@ -35,45 +30,26 @@ def fit_page(found: Fitted, folder: str, *, title: str) -> str:
         The name of the system.
 
     """
-    templates = environment()
-    templates.filters |= {"counted": counted, "duration": duration}
-    templates.globals |= {
-        "results": SimpleNamespace(emulated=found.records.emulated),
-        "anchors": set(),
-        "images": {},
-    }
     figures = {"predictions": _predictions(found)} if found.parts else {}
     forecast = found.twin.forecast
-    return templates.get_template("fit.html.j2").render(
+    return render_page(
+        environment(emulated=found.records.emulated),
+        "fit",
+        figures.values(),
         found=found,
         title=title,
         folder=folder,
         taken=found.score(found.chosen),
         parts=", ".join(dict.fromkeys(found.parts)),
-        horizon="in free simulation from the commands"
-        if found.horizon is None
-        else f"{found.horizon:g} s ahead of the last measurement",
-        errors=_errors(found),
+        units=units_of(found),
         comparison=comparison_table(found),
         parameters=parameter_table(found),
         terms=term_table(found),
-        sentences=tuple(model_sentences(found)),
+        sentences=model_sentences(found),
         bands=_bands(found),
         promised=forecast is not None and forecast.promised,
         figures=figures,
-        version=__version__,
-        specs=script_json(figure_specs(figures.values())),
-        plotly=plotly_js(),
     )
-
-
-def _errors(found: Fitted) -> list[str]:
-    """The error of each output, in a sentence."""
-    units, score = units_of(found), found.score(found.chosen)
-    return [
-        f"Its RMS error in {name} is {significant(error)}{units[name]}."
-        for name, error in score.rmse.items()
-    ]
 
 
 def _bands(found: Fitted) -> Table:
@@ -86,10 +62,9 @@ def _bands(found: Fitted) -> Table:
     ):
         ahead = f"{significant(lead)} s ahead" if np.isfinite(lead) else "free simulation"
         widths = zip(deviation, units.values(), strict=True)
-        cells = [Cell(f"± {significant(USUAL * each)}{unit}") for each, unit in widths]
-        rows.append([Cell(ahead), *cells, Cell(f"{number.min():.0f}")])
-    heads = columns("prediction", *units, "independent samples")
-    return Table("Bands by time ahead", heads, rows)
+        cells = [f"± {significant(USUAL * each)}{unit}" for each, unit in widths]
+        rows.append([ahead, *cells, f"{number.min():.0f}"])
+    return tabulate("Bands by time ahead", ["prediction", *units, "independent samples"], rows)
 
 
 def _predictions(found: Fitted) -> Figure:
@@ -111,8 +86,6 @@ def _predictions(found: Fitted) -> Figure:
             Line(times, mean, "predicted", PREDICTED, width=1.6),
         ]
         name, unit = records.outputs.names[i], records.outputs.units[i]
-        x = Axis("time", "s", (0.0, float(times[-1])), count=8)
-        y = Axis(name, "" if unit == "1" else unit)
-        panels.append(Panel(x, [Row(y, marks)], f"{name} over time", name, height=300))
+        panels.append(record_panel(times, name, unit, marks))
     keys = [Key("measured", MEASURED), Key("predicted, with its 90 % band", PREDICTED)]
     return Figure("predictions", panels, keys, str(records.ids[row]), columns=1)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.evaluation.identification import Identification
-from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row
+from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row, record_panel
+from retwin.report.labels import behind
 from retwin.report.residual_panels import (
     WHITE,
     ChannelRecords,
@@ -45,46 +48,30 @@ def figures(found: Identification) -> dict[str, Figure]:
 
 def _estimates(found: Identification) -> Figure:
     """Each estimate and its interval within its range, the first parameter on top."""
-    names = [each.name for each in found.parameters]
-    place = np.arange(len(names))[::-1].astype(float)
-    low = np.array([each.low for each in found.parameters])
-    width = np.array([each.high for each in found.parameters]) - low
+    known = found.parameters
+    place = np.arange(len(known))[::-1].astype(float)
+    low = np.array([each.low for each in known])
+    width = np.array([each.high for each in known]) - low
 
-    def shares(values: list[float]) -> NDArray:
-        return (np.array(values) - low) / width
+    def shares(values: Iterable[float]) -> NDArray:
+        return (np.array(list(values)) - low) / width
 
-    value = shares([each.value for each in found.parameters])
-    ends = [
-        each.interval if each.interval is not None else (each.value, each.value)
-        for each in found.parameters
-    ]
-    texts = [f"{p.name}: {p.value:.4g} {p.unit if p.unit != '1' else ''}" for p in found.parameters]
+    ends = [each.interval or (each.value, each.value) for each in known]
+    start, value = (shares(getattr(each, name) for each in known) for name in ("start", "value"))
+    inside = [np.clip(shares(values), 0, 1).tolist() for values in zip(*ends, strict=True)]
+    bars = list(zip(*inside, strict=True))
+    texts = [behind(f"{each.name}: {each.value:.4g}", each.unit) for each in known]
+    first = [f"{each.name} before: {each.start:.4g}" for each in known]
     marks: list[Mark] = [
-        Points(
-            shares([each.start for each in found.parameters]),
-            place,
-            "before",
-            BEFORE,
-            "diamond-open",
-            texts=[f"{p.name} before: {p.start:.4g}" for p in found.parameters],
-        ),
-        Points(
-            value,
-            place,
-            "after",
-            AFTER,
-            low=np.clip(shares([e[0] for e in ends]), 0, 1),
-            high=np.clip(shares([e[1] for e in ends]), 0, 1),
-            texts=texts,
-            bar_width=3,
-        ),
+        Points(start, place, "before", BEFORE, "diamond-open", texts=first),
+        Points(value, place, "after", AFTER, ends=bars, texts=texts, bar_width=3),
     ]
-    ticks = dict(zip(place.tolist(), names, strict=True))
+    ticks = {at: each.name for at, each in zip(place.tolist(), known, strict=True)}
     panel = Panel(
         Axis("place in its range", "", (-0.03, 1.03), "percent", step=0.25),
-        [Row(Axis("", kind="names", limits=(-0.6, len(names) - 0.4), ticks=ticks), marks)],
+        [Row(Axis("", kind="names", limits=(-0.6, len(known) - 0.4), ticks=ticks), marks)],
         "Estimates of the parameters and their 95 % intervals within their ranges",
-        height=MARGIN + ROW_HEIGHT * len(names),
+        height=MARGIN + ROW_HEIGHT * len(known),
     )
     keys = [Key("before", BEFORE, "diamond"), Key("after, with its 95 % interval", AFTER, "circle")]
     return Figure("estimates", [panel], keys, columns=1)
@@ -108,9 +95,7 @@ def _records(found: Identification, shown: list[int]) -> Figure:
             Line(times, after[row, chosen, i], "after", AFTER, width=1.6),
         ]
         name, unit = measured.outputs.names[i], measured.outputs.units[i]
-        y = Axis(name, "" if unit == "1" else unit)
-        x = Axis("time", "s", (float(times[0]), float(times[-1])), count=8)
-        panels.append(Panel(x, [Row(y, marks)], f"{name} over time", name, height=300))
+        panels.append(record_panel(times, name, unit, marks))
     keys = [Key("measured", MEASURED), *KEYS]
     return Figure("records", panels, keys, str(measured.ids[row]), columns=1)
 
@@ -138,8 +123,7 @@ def _residuals(
         pair = [each[..., i] for each in errors]
         if all(map(_useful, pair)):
             values = np.where(measured.mask[..., i], measured.observed[..., i], np.nan)
-            unit = "" if about.units[i] == "1" else about.units[i]
-            output = ChannelRecords(about.names[i], unit, values.astype(float))
+            output = ChannelRecords(about.names[i], about.units[i], values.astype(float))
             drawn.append(Errors(output, dict(zip(reversed(KEYS), reversed(pair), strict=True))))
     commands = [
         ChannelRecords(name, "", measured.commands[..., j].astype(float))

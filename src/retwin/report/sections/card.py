@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 from urllib.parse import quote
 
-from retwin.report.blocks import Cell, Link, Section, Table, columns
+from retwin.report.blocks import Cell, Link, Section, Table, tabulate, text_column
 from retwin.report.labels import class_name, counted, latent_names, quantity, real_data, source_name
 from retwin.report.study import Study
 from retwin.report.verdict import headline
@@ -171,15 +171,11 @@ def _data(study: Study) -> Table | None:
     rows = [
         _data_row(role, each) for role, each in roles.items() if each.n is not None or each.sha256
     ]
-    heads = columns("Role", "File", "Trajectories", "used", "SHA-256", texts=("File", "SHA-256"))
-    return Table("Data", heads, rows) if rows else None
+    heads = ["Role", text_column("File"), "Trajectories", "used", text_column("SHA-256")]
+    return tabulate("Data", heads, rows) if rows else None
 
 
-def _data_row(role: str, each: Dataset) -> list[Cell]:
-    return [
-        Cell(role),
-        Cell(each.name or "–"),
-        Cell("–" if each.n is None else str(each.n)),
-        Cell("all" if each.used is None else str(len(each.used))),
-        Cell(each.sha256 or "–", tone="code"),
-    ]
+def _data_row(role: str, each: Dataset) -> list[object]:
+    count = "–" if each.n is None else str(each.n)
+    used = "all" if each.used is None else str(len(each.used))
+    return [role, each.name or "–", count, used, Cell(each.sha256 or "–", tone="code")]

@@ -7,7 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from retwin.catalog import METRICS
-from retwin.report.blocks import Cell, Column, Forest, Section, Table, columns, grouped
+from retwin.report.blocks import (
+    Cell,
+    Column,
+    Forest,
+    Section,
+    Table,
+    grouped,
+    tabulate,
+    text_column,
+)
 from retwin.report.labels import (
     MANY,
     SELECTED,
@@ -69,10 +78,10 @@ def _matrix(study: Study, found: Sequence[Comparison], metric: str) -> Table:
             for e in pairs
         }
         name = Cell(f"{place + 1}. {source_name(source)}", source=source)
-        rows.append([name, *(cells.get(other, Cell("")) for other in study.sources)])
+        rows.append([name, *(cells.get(other, "") for other in study.sources)])
     others = [Column(str(place + 1), group="minus") for place in range(len(study.sources))]
     title = with_unit(f"Pairwise differences in {in_sentence(metric_name(metric))}", unit)
-    return Table(title, [Column("Source", numeric=False), *others], rows)
+    return tabulate(title, ["Source", *others], rows)
 
 
 def _axes(study: Study, found: Sequence[Comparison]) -> dict[str, tuple[float, float]]:
@@ -87,21 +96,20 @@ def _axes(study: Study, found: Sequence[Comparison]) -> dict[str, tuple[float, f
 
 
 def _pairs(study: Study, found: Sequence[Comparison]) -> Table:
-    names = "Outcome", "Difference", "95 % interval", "", "p, all pairs"
-    heads = columns("Score", *names, texts=("Outcome", ""))
-    heads += grouped("Welch’s test over runs", "t (df)", "p", "p, Holm")
+    heads = ["Score", text_column("Outcome"), "Difference", "95 % interval", text_column("")]
+    heads += ["p, all pairs", *grouped("Welch’s test over runs", "t (df)", "p", "p, Holm")]
     units = study.results.outputs.units
-    rows: list[list[Cell]] = []
+    rows: list[list[object]] = []
     last: tuple[str, str] | None = None
     oriented = _sorted(found)
     axes = _axes(study, oriented)
     for each in oriented:
         if (each.a, each.b) != last:
-            rows.append([Cell(f"{source_name(each.a)} minus {source_name(each.b)}")])
+            rows.append([f"{source_name(each.a)} minus {source_name(each.b)}"])
         last = each.a, each.b
         axis = axes.get(metric_quantity(each.metric, units)[1], (0.0, 0.0))
         rows.append(_row(each, units, axis))
-    return Table("Differences, pair by pair", heads, rows)
+    return tabulate("Differences, pair by pair", heads, rows)
 
 
 def _sorted(found: Sequence[Comparison]) -> list[Comparison]:
@@ -114,7 +122,7 @@ def _sorted(found: Sequence[Comparison]) -> list[Comparison]:
     )
 
 
-def _row(each: Comparison, units: Sequence[str], axis: tuple[float, float]) -> list[Cell]:
+def _row(each: Comparison, units: Sequence[str], axis: tuple[float, float]) -> list[object]:
     forest, (low, high) = None, axis
     if each.interval is not None and np.isfinite(each.mean_diff) and high > low:
         lower, at, upper, zero = (
@@ -127,13 +135,13 @@ def _row(each: Comparison, units: Sequence[str], axis: tuple[float, float]) -> l
     # Draws that are all equal show no uncertainty, which does not mean that there is none.
     wide = each.interval is not None and each.interval[0] < each.interval[1]
     return [
-        Cell(metric_name(each.metric)),
+        metric_name(each.metric),
         Cell({"open": "undecided", "": "no verdict"}.get(result, result), tone=result),
-        Cell(mean),
-        Cell(interval if wide else "–"),
+        mean,
+        interval if wide else "–",
         Cell("", forest=forest, source=each.a),
-        Cell(p_value(each.p_verdict)),
-        Cell(f"{number(each.t, 2)} ({number(each.df, 1)})" if each.t is not None else "–"),
-        Cell(p_value(each.p)),
-        Cell(p_value(each.p_holm)),
+        p_value(each.p_verdict),
+        f"{number(each.t, 2)} ({number(each.df, 1)})" if each.t is not None else "–",
+        p_value(each.p),
+        p_value(each.p_holm),
     ]

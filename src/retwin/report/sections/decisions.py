@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from retwin.data.trajectories import HEALTHY
-from retwin.report.blocks import Cell, Section, Table, columns, grouped
+from retwin.report.blocks import Cell, Section, Table, grouped, tabulate, text_column
 from retwin.report.labels import class_name, distinct, number, percent, percents, source_name
 from retwin.report.lights import RATES, alarms
 from retwin.report.study import Study
 from retwin.report.verdict import headline
-from retwin.scores.decisions import Decision, decide
+from retwin.scores.decisions import Decision
 
 TRAJECTORIES, FAULTY, MISSED = 1000, 0.02, 50
 """The example: trajectories, share of faulty ones, cost of a missed fault in false alarms."""
 GROUP = f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty"
 DETECTED = ("Faults detected", "Detected at the rate", "of these, correct class")
-TEXTS = ("Most often missed", "Most often confused")
-"""Heads of columns of numbers and of classes."""
+"""Heads of columns."""
 
 
 def decisions(study: Study) -> Section | None:
@@ -33,18 +31,15 @@ def decisions(study: Study) -> Section | None:
     pair = headline(study.results)
     best = max(sources, key=lambda name: study.sources[name].mean("macro_f1"), default=None)
     best = pair[0] if pair is not None and pair[0] in sources else best
-    if best is None or HEALTHY not in study.results.classes:
+    chosen = None if best is None else alarms(study, best)
+    if best is None or chosen is None:
         return None
-    healthy = int((study.truth == study.results.classes.index(HEALTHY)).sum())
-    if healthy in (0, len(study.truth)):
-        return None
-    found = [_decide(study, best, rate) for rate in RATES]
+    found = [study.decision(best, rate) for rate in RATES]
     short = [each.requested for each in found if math.isnan(each.threshold)]
-    chosen = alarms(study, best)
-    rate = chosen.decision.guaranteed if chosen and chosen.decision else math.nan
+    rate = chosen.decision.guaranteed if chosen.decision else math.nan
     values = {
         "source": best,
-        "healthy": healthy,
+        "healthy": chosen.healthy,
         "chosen": chosen,
         "all": None if math.isnan(rate) else _all_sources(study, sources, rate),
         "table": _table(best, [each for each in found if math.isfinite(each.threshold)]),
@@ -52,20 +47,17 @@ def decisions(study: Study) -> Section | None:
         "lowest": short[-1] if short else None,
         "needed": math.ceil(1 / short[-1]) - 1 if short else 0,
     }
-    scripts = {"calculator": _calculator(study, sources, best, healthy) | {"rate": 100 * rate}}
+    scripts = {
+        "calculator": _calculator(study, sources, best, chosen.healthy) | {"rate": 100 * rate}
+    }
     return Section("decisions", "Decisions", values, scripts=scripts)
-
-
-def _decide(study: Study, source: str, rate: float) -> Decision:
-    first = study.probabilities(source)[0]
-    return decide(first, study.truth, study.results.classes, rate)
 
 
 def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
     """A row per source at the same false-alarm rate."""
-    heads = columns("Source", *DETECTED, "Most often missed", texts=TEXTS)
+    heads: list[object] = ["Source", *DETECTED, text_column("Most often missed")]
     heads += grouped(GROUP, f"cost, 1 : {MISSED}")
-    found = {name: _decide(study, name, rate) for name in sources}
+    found = {name: study.decision(name, rate) for name in sources}
     best = max(each.detected for each in found.values())
     rows = []
     for name, each in found.items():
@@ -74,45 +66,46 @@ def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
             [
                 Cell(source_name(name), name, source=name),
                 Cell(percent(each.detected), f"[{percents(each.interval)}]", each.detected == best),
-                Cell(percents(each.at_rate)),
-                Cell(percent(each.identified)),
-                Cell(class_name(each.most_missed) or "none"),
-                Cell(number(cost.total, 0)),
+                percents(each.at_rate),
+                percent(each.identified),
+                class_name(each.most_missed) or "none",
+                number(cost.total, 0),
             ]
         )
-    return Table("All sources at the same false-alarm rate", heads, rows)
+    return tabulate("All sources at the same false-alarm rate", heads, rows)
 
 
 def _table(source: str, found: list[Decision]) -> Table:
-    names = "Alarm threshold", "Its false alarms", *DETECTED, *TEXTS
-    heads = columns("Requested false-alarm rate", *names, texts=TEXTS)
+    heads: list[object] = ["Requested false-alarm rate", "Alarm threshold"]
+    heads += ["Its false alarms", *DETECTED]
+    heads += [text_column("Most often missed"), text_column("Most often confused")]
     heads += grouped(GROUP, "false alarms", "missed faults", f"cost, 1 : {MISSED}")
     digits = distinct(each.threshold for each in found)
     title = f"Cost of a false-alarm rate, {source_name(source)}"
-    return Table(title, heads, [_row(each, digits) for each in found])
+    return tabulate(title, heads, [_row(each, digits) for each in found])
 
 
-def _row(each: Decision, digits: int) -> list[Cell]:
+def _row(each: Decision, digits: int) -> list[object]:
     cost = each.cost(trajectories=TRAJECTORIES, faulty=FAULTY, missed=MISSED)
     return [
-        Cell(percent(each.requested)),
-        Cell(number(each.threshold, digits)),
-        Cell(percents(each.false_alarms)),
+        percent(each.requested),
+        number(each.threshold, digits),
+        percents(each.false_alarms),
         Cell(percent(each.detected), f"[{percents(each.interval)}]"),
-        Cell(percents(each.at_rate)),
-        Cell(percent(each.identified)),
-        Cell(class_name(each.most_missed) or "none"),
-        Cell(" as ".join(map(class_name, each.most_confused)) or "none"),
-        Cell(number(cost.false_alarms, 0)),
-        Cell(number(cost.missed_faults, 1)),
-        Cell(number(cost.total, 0)),
+        percents(each.at_rate),
+        percent(each.identified),
+        class_name(each.most_missed) or "none",
+        " as ".join(map(class_name, each.most_confused)) or "none",
+        number(cost.false_alarms, 0),
+        number(cost.missed_faults, 1),
+        number(cost.total, 0),
     ]
 
 
 def _calculator(study: Study, sources: list[str], first: str, healthy: int) -> dict[str, Any]:
     """Every distinct decision of each source: there are as many as healthy trajectories."""
     rates = [rank / (healthy + 1) for rank in range(1, healthy + 1)]
-    decided = {name: [_decide(study, name, rate) for rate in rates] for name in sources}
+    decided = {name: [study.decision(name, rate) for rate in rates] for name in sources}
     return {
         "healthy": healthy,
         "first": sources.index(first),
@@ -131,7 +124,7 @@ def _calculator(study: Study, sources: list[str], first: str, healthy: int) -> d
 
 def _entry(each: Decision, digits: int) -> dict[str, Any]:
     """The numbers that costs are computed from, and the texts of the table's cells."""
-    cells = _row(each, digits)[1:8]
+    (cells,) = tabulate("", [], [_row(each, digits)[1:8]]).rows
     return {
         "rate": each.guaranteed,
         "detected": each.detected,

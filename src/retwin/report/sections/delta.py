@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from retwin.report.blocks import Cell, Section, Table, columns
+from retwin.report.blocks import Cell, Section, Table, tabulate
 from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row, Spans
-from retwin.report.labels import number, places, signed
+from retwin.report.labels import number, places, shown_unit, signed
 from retwin.report.study import Study
 from retwin.report.style import colour_of
 
@@ -65,16 +65,10 @@ def _parameters(study: Study) -> Table | None:
     ):
         given, estimate, error, correlation = estimates
         known = math.isfinite(error)
-        digits = places(error) if known else places(estimate)
+        digits = places([error if known else estimate])
         strongest = f"{signed(correlation, 2)} with {other}" if math.isfinite(correlation) else "–"
-        rows.append(
-            [
-                Cell(name, below=unit if unit != "1" else ""),
-                Cell(number(given, places(given)) if math.isfinite(given) else "–"),
-                Cell(number(estimate, digits) if known else "not determined"),
-                Cell(number(error, digits) if known else "–"),
-                Cell(strongest),
-            ]
-        )
-    heads = ("As given", "Estimate", "Standard error", "Strongest correlation")
-    return Table("Parameters beside the discrepancy", columns("Parameter", *heads), rows)
+        shown = number(estimate, digits) if known else "not determined"
+        ends = number(given, places([given])), shown, number(error, digits), strongest
+        rows.append([Cell(name, below=shown_unit(unit)), *ends])
+    heads = "Parameter", "As given", "Estimate", "Standard error", "Strongest correlation"
+    return tabulate("Parameters beside the discrepancy", heads, rows)

@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from retwin.report.blocks import Cell, Section, Table, columns
-from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row
+from retwin.report.blocks import Cell, Section, Table, tabulate
+from retwin.report.figure import Axis, Figure, Key, Line, Panel, Row, bar, outline
 from retwin.report.labels import (
     latent_names,
     number,
     order,
-    quantity,
     source_name,
     span,
     with_role,
@@ -92,17 +89,11 @@ def figure_cell(figure: FidelityFigure | None, digits: int = 3, factor: float = 
 
 def latents(study: Study, source: str) -> list[Latent]:
     """Every component of z of which there are observed and generated values."""
-    both = [study.arrays.get(f"z/{source}/{name}") for name in ("observed", "predicted")]
-    fidelity = study.results.fidelity[source]
-    units = [*fidelity.latent_units, *[""] * len(fidelity.latents)]
-    found = []
-    for column, name in enumerate(fidelity.latents):
-        factor, unit = quantity(units[column])
-        values = [factor * each[:, column] for each in both if each is not None]
-        histogram = common_histogram(*values) if len(values) == 2 else None
-        if histogram is not None:
-            found.append(Latent(name, unit, histogram))
-    return found
+    return [
+        Latent(each.name, each.unit, histogram)
+        for each in study.components(source)
+        if (histogram := common_histogram(each.observed, each.predicted)) is not None
+    ]
 
 
 def _groups(study: Study, source: str) -> list[dict[str, Any]]:
@@ -129,12 +120,9 @@ def _panel(latent: Latent, colour: str) -> Panel:
     title, label = latent_names(latent.name)
     values = latent.values
     low, high = float(values.edges[0]), float(values.edges[-1])
-    # A step to each bin's share at its left edge; the first point lifts the line from zero.
-    edges = np.concatenate([values.edges[:1], values.edges])
-    shares = np.concatenate([[0], values.generated, [0]])
-    marks: list[Mark] = [
-        Bars(values.edges, values.observed, "observed", "observed"),
-        Line(edges, shares, "generated", colour, width=2.2, step=True),
+    marks = [
+        bar(values.edges, values.observed, "observed", "observed"),
+        Line(*outline(values.edges, values.generated), "generated", colour, width=2.2),
     ]
     limits = f"{number(low, 1)} to {number(high, 1)}"
     return Panel(
@@ -150,12 +138,12 @@ def _agreement(study: Study, source: str) -> Table | None:
     fidelity = study.results.fidelity[source]
     rows = [
         [
-            Cell(latent_names(name)[0]),
+            latent_names(name)[0],
             figure_cell(distance, 2),
-            Cell(number(distance.p, 2)),
+            number(distance.p, 2),
             figure_cell(fidelity.figures.get(f"coverage90/{name}"), 2),
         ]
         for name, distance in fidelity.agreement.items()
     ]
-    heads = columns("Per segment", "KS distance", "p", "in the 90 % range")
-    return Table(titled(study, source, "Agreement per segment"), heads, rows) if rows else None
+    heads = "Per segment", "KS distance", "p", "in the 90 % range"
+    return tabulate(titled(study, source, "Agreement per segment"), heads, rows) if rows else None

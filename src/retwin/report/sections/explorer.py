@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.report.blocks import Section
 from retwin.report.figure import Key
-from retwin.report.labels import class_name, quantity, source_name
+from retwin.report.labels import class_name, quantities, source_name
 from retwin.report.study import Study
 from retwin.report.style import DASHES, PALETTE, colour_index, colour_of
 from retwin.results import OverlayInfo
@@ -61,9 +61,10 @@ def _pose_keys(pose: dict[str, Any], source: str) -> list[Key]:
 
 def _content(study: Study, overlay: OverlayInfo) -> dict[str, Any]:
     """Everything that the page's script draws, as JSON."""
-    results, arrays = study.results, study.arrays
-    outputs = [quantity(unit) for unit in results.outputs.units]
-    inputs = [quantity(unit) for unit in results.inputs.units]
+    results, portrait = study.results, study.portrait
+    inputs, outputs = (
+        quantities(each.units, len(each.names)) for each in (results.inputs, results.outputs)
+    )
     scale = np.array([factor for factor, _ in outputs])
     sources = [name for name in study.sources if study.probabilities(name).size]
     probabilities = [study.probabilities(name).mean(axis=0) for name in sources]
@@ -73,13 +74,13 @@ def _content(study: Study, overlay: OverlayInfo) -> dict[str, Any]:
         "classes": [class_name(name) for name in results.classes],
         "sources": [{"name": source_name(n), "colour": colour_index(n)} for n in sources],
         "probabilities": packed(np.array(probabilities)) if sources else None,
-        "rate": float(arrays["portrait/rate"]),
+        "rate": float(portrait["rate"]),
         "inputs": {"names": results.inputs.names, "units": [unit for _, unit in inputs]},
         "outputs": {"names": results.outputs.names, "units": [unit for _, unit in outputs]},
-        "commands": packed(np.array([f for f, _ in inputs]) * arrays["portrait/commands"], 1),
-        **{name: packed(scale * arrays[f"portrait/{name}"], 1) for name in ("nominal", "observed")},
-        "bands": packed(scale * arrays["portrait/bands"], 2, COARSE),
-        "times": packed(arrays["portrait/times"]),
+        "commands": packed(np.array([f for f, _ in inputs]) * portrait["commands"], 1),
+        **{name: packed(scale * portrait[name], 1) for name in ("nominal", "observed")},
+        "bands": packed(scale * portrait["bands"], 2, COARSE),
+        "times": packed(portrait["times"]),
         "colour": colour_index(overlay.source),
         "latent": _latent(study, overlay),
         "pose": _poses(study),
@@ -88,16 +89,16 @@ def _content(study: Study, overlay: OverlayInfo) -> dict[str, Any]:
 
 def _latent(study: Study, overlay: OverlayInfo) -> dict[str, Any] | None:
     """The inferred z and its standard deviation, in the units that are shown."""
-    arrays = study.arrays
-    if not np.isfinite(arrays["portrait/z"]).any():
+    portrait = study.portrait
+    if not np.isfinite(portrait["z"]).any():
         return None
-    factors = [quantity(unit) for unit in overlay.latent_units]
+    factors = quantities(overlay.latent_units, len(overlay.latents))
     scale = np.array([factor for factor, _ in factors])
     return {
         "names": [name.replace("_", " ") for name in overlay.latents],
         "units": [unit for _, unit in factors],
-        "z": _rounded(scale * arrays["portrait/z"]),
-        "deviation": _rounded(scale * arrays["portrait/deviation"]),
+        "z": _rounded(scale * portrait["z"]),
+        "deviation": _rounded(scale * portrait["deviation"]),
     }
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.report.blocks import Cell, Column, Section, Table, columns
+from retwin.report.blocks import Cell, Section, Table, grouped, tabulate
 from retwin.report.figure import (
     Axis,
     Band,
@@ -19,9 +19,9 @@ from retwin.report.figure import (
     Panel,
     Row,
     draw_bands,
-    edges_of,
+    outline,
 )
-from retwin.report.labels import number, order, places, quantity, source_name, span, with_unit
+from retwin.report.labels import number, order, places, quantities, source_name, span, with_unit
 from retwin.report.sections.discrepancy import detailed, figure_cell, suffixes, titled
 from retwin.report.study import Study
 from retwin.report.style import colour_of
@@ -76,12 +76,12 @@ def fidelity(study: Study) -> Section | None:
 
 def _lengths(each: FidelityResults, energy: str) -> list[tuple[str, str, float, str]]:
     """Key, title, factor and unit of the CRPS of each output; `energy` is put behind them."""
-    units = [*each.units, *[""] * len(each.outputs)]
-    rows = [(f"crps/{n}", f"CRPS {n}", u) for n, u in zip(each.outputs, units, strict=False)]
+    units = quantities(each.units, len(each.outputs))
+    rows = [(f"crps/{n}", f"CRPS {n}", *u) for n, u in zip(each.outputs, units, strict=True)]
     if energy and len(each.outputs) > 1:
-        rows.append(("crps", energy, ""))
-    rows.append(("energy", "Energy score", units[0] if len(set(each.units)) == 1 else ""))
-    return [(key, title, *quantity(unit)) for key, title, unit in rows]
+        rows.append(("crps", energy, 1.0, ""))
+    common = units[0] if len(set(each.units)) == 1 else (1.0, "")
+    return [*rows, ("energy", "Energy score", *common)]
 
 
 def _overview(study: Study, sources: list[str]) -> Table:
@@ -90,7 +90,7 @@ def _overview(study: Study, sources: list[str]) -> Table:
     lengths = _lengths(study.results.fidelity[sources[0]], "")
     shown = [*lengths, *((key, title, 1.0, "") for key, title in SHARES.items())]
     shown = [each for each in shown if any(each[0] in figures for figures in known.values())]
-    heads = columns("Source", *(with_unit(title, unit) for _, title, _, unit in shown))
+    heads = ["Source", *(with_unit(title, unit) for _, title, _, unit in shown)]
     digits = dict.fromkeys(SHARES, 2) | {
         key: _digits((each.get(key) for each in known.values()), factor)
         for key, _, factor, _ in lengths
@@ -102,34 +102,34 @@ def _overview(study: Study, sources: list[str]) -> Table:
         ]
         for name, figures in known.items()
     ]
-    return Table("Fidelity of all sources", heads, rows)
+    return tabulate("Fidelity of all sources", heads, rows)
 
 
 def _digits(figures: Iterable[FidelityFigure | None], factor: float) -> int:
     """Decimals with which the scores have three digits."""
-    return places(*(factor * each.value for each in figures if each is not None))
+    return places(factor * each.value for each in figures if each is not None)
 
 
 def _scores(study: Study, source: str) -> Table:
     """CRPS and energy score of this twin and its rivals, and the paired differences."""
     each = study.results.fidelity[source]
-    heads = columns("Score", source_name(source))
+    heads: list[object] = ["Score", source_name(source)]
     for rival in each.rivals:
         name = RIVALS.get(rival, rival)
-        heads += [Column("score", group=name), Column("reduction by this twin, %", group=name)]
+        heads += grouped(name, "score", "reduction by this twin, %")
     rows = []
     for key, title, factor, unit in _lengths(each, "CRPS, mean over outputs"):
         kind, *output = key.split("/", 1)
         keys = (key, *(f"{key}/{rival}" for rival in each.rivals))
         scored = [each.figures.get(name) for name in keys]
         digits = _digits(scored, factor)
-        row = [Cell(with_unit(title, unit)), figure_cell(scored[0], digits, factor)]
+        row: list[object] = [with_unit(title, unit), figure_cell(scored[0], digits, factor)]
         for rival, theirs in zip(each.rivals, scored[1:], strict=True):
             row.append(figure_cell(theirs, digits, factor))
             below = "/".join([f"{kind}_below", *output, rival])
             row.append(figure_cell(each.figures.get(below), 0, 100.0))
         rows.append(row)
-    return Table(titled(study, source, "Scores of the draws"), heads, rows)
+    return tabulate(titled(study, source, "Scores of the draws"), heads, rows)
 
 
 def _calibration(study: Study, source: str) -> Table:
@@ -143,18 +143,12 @@ def _calibration(study: Study, source: str) -> Table:
         "auroc": ("Classifier of real against generated, AUROC", "0.50"),
     }
     rows = [
-        [
-            Cell(title),
-            Cell(number(each.figures[key].value, 2)),
-            Cell(span(each.figures[key].ends, 2)),
-            Cell(number(each.figures[key].p, 2)),
-            Cell(ideal),
-        ]
+        [title, number(found.value, 2), span(found.ends, 2), number(found.p, 2), ideal]
         for key, (title, ideal) in titles.items()
-        if key in each.figures
+        if (found := each.figures.get(key))
     ]
-    heads = columns("Calibration", "Value", "95 % interval", "p", "Ideal")
-    return Table(titled(study, source, "Calibration of the draws"), heads, rows)
+    heads = "Calibration", "Value", "95 % interval", "p", "Ideal"
+    return tabulate(titled(study, source, "Calibration of the draws"), heads, rows)
 
 
 def _figures(study: Study, source: str) -> dict[str, Figure]:
@@ -172,7 +166,7 @@ def _pit(source: str, name: str, pit: NDArray) -> Figure:
     count = pit.shape[1]
     edges = np.linspace(0, 1, count + 1)
     colour = colour_of(source)
-    x, measured = edges_of(pit[0], edges)
+    x, measured = (each[1:-1] for each in outline(edges, pit[0]))
     marks: list[Mark] = [
         Band(x, np.repeat(pit[1], 2), np.repeat(pit[2], 2), "perfect generators", colour, 0.25),
         Line([0, 1], [1 / count] * 2, "uniform", "muted", "dot", 1, hover=False),
@@ -197,14 +191,14 @@ def _bands(study: Study, source: str, name: str) -> Figure:
     The first trajectory is the typical one, the second the worst.
     """
     parts, each = study.bands(source), study.results.fidelity[source]
-    units = [*each.units, *[""] * len(each.outputs)]
+    units = quantities(each.units, len(each.outputs))
     residual = np.where(parts["seen"][..., None], parts["observed"] - parts["nominal"], np.nan)
     quantiles = parts["quantiles"] - parts["nominal"][:, None]
     time = np.arange(residual.shape[1]) / float(parts["rate"])
     panels = []
     for i, trajectory in enumerate(parts["ids"].tolist()):
         for c, output in enumerate(each.outputs):
-            factor, unit = quantity(units[c])
+            factor, unit = units[c]
             marks: list[Mark] = [
                 *draw_bands(time, factor * quantiles[i, :, :, c], colour_of(source)),
                 Line(time, factor * residual[i, :, c], "measured", "ink", width=1.6),

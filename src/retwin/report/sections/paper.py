@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from retwin.catalog import METRICS
-from retwin.report.blocks import Cell, Column, Link, Section, Table
+from retwin.report.blocks import Cell, Column, Link, Section, grouped, tabulate, text_column
 from retwin.report.labels import (
     MAIN,
     duration,
@@ -15,12 +15,11 @@ from retwin.report.labels import (
     order,
     source_name,
 )
-from retwin.report.sections.costs import PUBLISHED_BULK
+from retwin.report.sections.time import PUBLISHED_BULK
 from retwin.report.study import Study
 
 TABLE1 = tuple(name for name in MAIN if not METRICS[name].simulated)
 """The metrics of the paper's Table 1."""
-PAPER, HERE = "the paper", "this study"
 
 
 def paper(study: Study) -> Section | None:
@@ -28,11 +27,11 @@ def paper(study: Study) -> Section | None:
     known = [name for name in order(study.results.published) if name in study.sources]
     if not known:
         return None
-    columns = [
-        Column("Item of the paper", numeric=False),
-        *(Column(source_name(name), group=PAPER, paper=True) for name in known),
-        *(Column(source_name(name), group=HERE) for name in known),
-        Column("on this page", numeric=False),
+    heads = [
+        "Item of the paper",
+        *(Column(source_name(name), group="the paper", paper=True) for name in known),
+        *grouped("this study", *map(source_name, known)),
+        text_column("on this page"),
     ]
     dashes = ["–"] * len(known)
     rows = [
@@ -65,12 +64,12 @@ def paper(study: Study) -> Section | None:
             Link("Time", "time"),
         ),
     ]
-    table = Table("Table 1, figures 3 to 6 and times", columns, rows)
+    table = tabulate("Table 1, figures 3 to 6 and times", heads, rows)
     return Section("paper", "The paper and this study", {"table": table})
 
 
-def _row(what: str, published: list[str], here: list[str], link: Link) -> list[Cell]:
-    return [Cell(what), *map(Cell, published), *map(Cell, here), Cell("", links=[link])]
+def _row(what: str, published: list[str], here: list[str], link: Link) -> list[object]:
+    return [what, *published, *here, Cell("", links=[link])]
 
 
 def _published(study: Study, known: list[str], key: str) -> list[str]:
@@ -81,7 +80,7 @@ def _means(study: Study, known: list[str], metric: str) -> list[str]:
     return [mean_and_deviation(study.sources[name].runs(metric)) for name in known]
 
 
-def _distributions(study: Study, known: list[str]) -> list[list[Cell]]:
+def _distributions(study: Study, known: list[str]) -> list[list[object]]:
     """KS distances of delays (figure 5) and of offsets (figure 6), a row per component."""
     fidelity = [study.results.fidelity.get(name) for name in known]
     found = [each.agreement if each else {} for each in fidelity]

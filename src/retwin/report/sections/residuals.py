@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import runs
-from retwin.report.blocks import Cell, Section, Table, columns
+from retwin.report.blocks import Cell, Section, Table, tabulate
 from retwin.report.figure import Axis, Figure, Key, Mark, Panel, Points, Row, Spans
 from retwin.report.labels import decimals, number, p_value, quantity, source_name, with_unit
 from retwin.report.residual_panels import (
@@ -28,7 +27,6 @@ from retwin.scores.residuals import (
     Correlogram,
     autocorrelation,
     cross_correlation,
-    decorrelated_after,
     error_by_amplitude,
     ljung_box,
     rms_over_time,
@@ -42,19 +40,6 @@ BLOCKS = 40
 """Blocks of the error over time."""
 
 
-@dataclass(frozen=True)
-class OutputErrors:
-    """An output, and by source what was measured minus what was simulated (n, T)."""
-
-    output: ChannelRecords
-    by_source: Mapping[str, NDArray]
-
-    def of(self, sources: Iterable[str]) -> Errors:
-        """The errors of some sources, by their keys."""
-        keys = {name: Key(source_name(name), colour_of(name), dash(name)) for name in sources}
-        return Errors(self.output, {key: self.by_source[name] for name, key in keys.items()})
-
-
 def residuals(study: Study) -> Section | None:
     """A table of all sources; figures of the plain twin, the best other one, and `dynamics`."""
     known = [name for name in study.sources if f"simulation/{name}/mean" in study.arrays]
@@ -65,10 +50,13 @@ def residuals(study: Study) -> Section | None:
     commands, errors = _channels(study, "commands"), _errors(study, known)
     channels = [*(each.output for each in errors), *commands]
     outside = np.any([each.outside for each in channels], axis=0)
-    figures = _figures(study, [each.of(shown) for each in errors], commands, outside)
+    drawn = [
+        Errors(each.output, {key: each.by_key[key] for key in map(_key, shown)}) for each in errors
+    ]
+    figures = _figures(study, drawn, commands, outside)
     figures = [each for each in figures if each.panels]
     values = {
-        "table": _table(study, errors, commands, outside),
+        "table": _table(study, known, errors, commands, outside),
         "figures": {each.name: each for each in figures},
         "limited": len(errors) > OUTPUTS or len(commands) > COMMANDS,
         "ranged": "simulation/range" in study.arrays,
@@ -101,6 +89,10 @@ def _figures(
     ]
 
 
+def _key(source: str) -> Key:
+    return Key(source_name(source), colour_of(source), dash(source))
+
+
 def _rate(study: Study) -> float:
     return float(study.arrays["simulation/rate"])
 
@@ -123,7 +115,7 @@ def _channels(study: Study, kind: str) -> list[ChannelRecords]:
     ]
 
 
-def _errors(study: Study, sources: Sequence[str]) -> list[OutputErrors]:
+def _errors(study: Study, sources: Sequence[str]) -> list[Errors]:
     """The errors of each output, in the units that are shown."""
     means = {name: study.arrays[f"simulation/{name}/mean"].astype(float) for name in sources}
     outputs = _channels(study, "observed")
@@ -131,38 +123,34 @@ def _errors(study: Study, sources: Sequence[str]) -> list[OutputErrors]:
     made = []
     for i, each in enumerate(outputs):
         factor = quantity(units[i])[0]
-        errors = {name: each.values - factor * mean[..., i] for name, mean in means.items()}
-        made.append(OutputErrors(each, errors))
+        errors = {_key(name): each.values - factor * mean[..., i] for name, mean in means.items()}
+        made.append(Errors(each, errors))
     return made
 
 
 def _table(
-    study: Study, errors: list[OutputErrors], commands: list[ChannelRecords], outside: NDArray
+    study: Study,
+    sources: Sequence[str],
+    errors: list[Errors],
+    commands: list[ChannelRecords],
+    outside: NDArray,
 ) -> Table:
-    heads = columns(
-        "Source",
-        "RMSE",
-        "mean error",
-        "largest autocorrelation",
-        "p, white",
-        "largest correlation with a command",
-        "RMSE outside the calibration",
-    )
-    rows: list[list[Cell]] = []
+    heads = ["Source", "RMSE", "mean error", "largest autocorrelation", "p, white"]
+    heads += ["largest correlation with a command", "RMSE outside the calibration"]
+    rows: list[list[object]] = []
     for each in errors:
         if len(errors) > 1:
-            rows.append([Cell(with_unit(each.output.name, each.output.unit))])
-        lags = decorrelated_after(next(iter(each.by_source.values())))
-        for source, error in each.by_source.items():
-            found = _row(error, commands, lags, outside, _rate(study))
+            rows.append([with_unit(each.output.name, each.output.unit)])
+        for source, error in zip(sources, each.by_key.values(), strict=True):
+            found = _row(error, commands, each.lags, outside, _rate(study))
             rows.append([Cell(source_name(source), source=source), *found])
     title, output = "Residuals of all sources", errors[0].output
-    return Table(title if len(errors) > 1 else with_unit(title, output.unit), heads, rows)
+    return tabulate(title if len(errors) > 1 else with_unit(title, output.unit), heads, rows)
 
 
 def _row(
     error: NDArray, commands: Iterable[ChannelRecords], lags: int, outside: NDArray, rate: float
-) -> list[Cell]:
+) -> list[object]:
     """The cells of one source for one output."""
     own = autocorrelation(error)
     crossed = [(u, cross_correlation(error, u.values, lags)) for u in commands]
@@ -170,10 +158,10 @@ def _row(
     (rms, mean), (beyond, _) = _moments(error), _moments(error[outside])
     share = np.mean(outside[np.isfinite(error)]) if np.isfinite(rms) else 0.0
     return [
-        Cell(number(rms)),
-        Cell(number(mean, decimals(rms))),
+        number(rms),
+        number(mean, decimals(rms)),
         Cell(*_at_lag(own, rate)),
-        Cell(p_value(ljung_box(own)[1])),
+        p_value(ljung_box(own)[1]),
         Cell(*_at_lag(cross, rate, command.name)),
         Cell(number(beyond, decimals(rms)), f"{100 * share:.2g} % of the samples"),
     ]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from retwin.catalog import METRICS
-from retwin.report.blocks import Cell, Column, Section, Table
+from retwin.report.blocks import Cell, Column, Section, Table, tabulate
 from retwin.report.figure import Axis, Figure, Heading, Key, Mark, Panel, Points, Row
 from retwin.report.labels import (
     MAIN,
@@ -30,13 +29,7 @@ from retwin.report.labels import (
 from retwin.report.study import Study
 from retwin.report.style import colour_of, symbol
 from retwin.results import Results
-from retwin.scores.calibration import calibration_floor
 from retwin.source_results import SourceResults
-
-FURTHER = tuple(
-    name for name, metric in METRICS.items() if not metric.headline and metric.unit == "1"
-)
-"""The metrics of the second table."""
 
 
 def scores(study: Study) -> Section | None:
@@ -44,7 +37,7 @@ def scores(study: Study) -> Section | None:
     shown = [name for name in MAIN if study.results.has(name)]
     if not shown:
         return None
-    values = _table_values(study, shown, "Scores of all sources")
+    values = table_values(study, shown, "Scores of all sources")
     if not study.results.classes:
         table = values["table"]
         costs = [Cell(duration(source.update_s)) for source in study.sources.values()]
@@ -59,50 +52,31 @@ def scores(study: Study) -> Section | None:
     return Section("scores", "Scores", values, figures)
 
 
-def further_scores(study: Study) -> Section | None:
-    """The scores that the paper does not give, and the noise floor of the calibration error."""
-    shown = [name for name in FURTHER if study.results.has(name)]
-    if not shown:
-        return None
-    ece = study.results.has("ece")
-    floors = {
-        name: calibration_floor(study.probabilities(name)) if name in study.diagnosing else None
-        for name in (study.sources if ece else ())
-    }
-    computed = any(floor is not None for floor in floors.values())
-    title = "Further scores of all sources"
-    values = _table_values(study, shown, title, floors if computed else {})
-    values |= {"ece": ece, "computed": computed, "count": study.results.data.test.size or "few"}
-    return Section("further", "Further scores", values)
-
-
-def _table_values(
+def table_values(
     study: Study, metrics: Sequence[str], title: str, floors: dict[str, float | None] | None = None
 ) -> dict[str, Any]:
     """A row per source, and what the caption states of it."""
     results = study.results
     paper = any(_in_paper(results, name) for name in metrics)
-    columns = [Column("Training data" if results.classes else "Source", numeric=False)]
     shown = {name: metric_quantity(name, results.outputs.units) for name in metrics}
-    columns += [Column(with_unit(metric_name(name), unit)) for name, (_, unit) in shown.items()]
-    if floors:
-        columns.append(Column("ECE floor"))
+    heads = ["Training data" if results.classes else "Source", *(["ECE floor"] if floors else [])]
+    heads[1:1] = [with_unit(metric_name(name), unit) for name, (_, unit) in shown.items()]
     best = {name: _best(results, name) for name in metrics}
     rows = []
     for name, source in study.sources.items():
         used = f"{study.word} data: {real_data(source.real_data, classes=bool(results.classes))}"
         known = ["fault protocol known"] if source.fault_protocol_known else []
-        row = [Cell(source_name(name), "; ".join([name, used, *known]), source=name)]
+        row: list[object] = [Cell(source_name(name), "; ".join([name, used, *known]), source=name)]
         for metric, (factor, _) in shown.items():
             values, interval = factor * np.asarray(source.runs(metric)), source.interval(metric)
             ends = [factor * end for end in interval or ()]
             below = f"[{span(ends, decimals(factor * source.mean(metric)))}]" if ends else ""
             published = results.published.get(name, {}).get(metric, "")
-            cell = Cell(mean_and_deviation(values), below, best=name in best[metric])
-            row.append(replace(cell, paper=published))
-        rows.append([*row, Cell(number(floors[name]))] if floors else row)
+            text, leads = mean_and_deviation(values), name in best[metric]
+            row.append(Cell(text, below, best=leads, paper=published))
+        rows.append([*row, number(floors[name])] if floors else row)
     return {
-        "table": Table(title, columns, rows),
+        "table": tabulate(title, heads, rows),
         "paper": paper,
         "intervals": any(source.intervals for source in study.sources.values()),
         "protocol_known": any(source.fault_protocol_known for source in study.sources.values()),
@@ -134,12 +108,15 @@ def _figure(study: Study, metrics: Sequence[str]) -> Figure:
     keys = [Key(source_name(name), colour_of(name), symbol(name)) for name in sources]
     for name, source in sources.items():
         marks.append(_points(name, source, metrics, lanes[name]))
-        values = study.results.published.get(name, {})
-        found = {m: _published(values[m]) for m in metrics if m in values}
-        known = [(m, value) for m, value in found.items() if value is not None]
+        texts = study.results.published.get(name, {})
+        known = {m: each for m in metrics if (each := _published(texts.get(m, "")))}
         if known:
-            heights = [metrics.index(m) + lanes[name] + 0.35 * width for m, _ in known]
-            marks.append(_published_points(name, [value for _, value in known], heights))
+            means = [mean for mean, _ in known.values()]
+            title, look = f"{source_name(name)} (paper)", (colour_of(name), "diamond-open")
+            heights = [metrics.index(m) + lanes[name] + 0.35 * width for m in known]
+            ends = [(mean - deviation, mean + deviation) for mean, deviation in known.values()]
+            shown = list(map(number, means))
+            marks.append(Points(means, heights, title, *look, ends, texts=shown, bar_width=1))
     if len(marks) > len(metrics) + len(sources):
         keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond-open"))
     ticks = {
@@ -168,27 +145,9 @@ def _points(name: str, source: SourceResults, metrics: Sequence[str], lane: floa
         source_name(name),
         colour_of(name),
         symbol(name),
-        low=[low for low, _ in ends],
-        high=[high for _, high in ends],
+        ends=ends,
         texts=[f"{mean_and_deviation(source.runs(m))} [{span(source.interval(m))}]" for m in shown],
         size=10,
-    )
-
-
-def _published_points(
-    name: str, values: Sequence[tuple[float, float]], heights: Sequence[float]
-) -> Points:
-    """The paper's means with one standard deviation, as open diamonds."""
-    return Points(
-        [mean for mean, _ in values],
-        heights,
-        f"{source_name(name)} (paper)",
-        colour_of(name),
-        "diamond-open",
-        low=[mean - deviation for mean, deviation in values],
-        high=[mean + deviation for mean, deviation in values],
-        texts=[number(mean) for mean, _ in values],
-        bar_width=1,
     )
 
 

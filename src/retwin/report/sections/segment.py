@@ -9,11 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.data.trajectories import HEALTHY
 from retwin.report.figure import Axis, Dimension, Figure, Key, Line, Mark, Panel, Row, Spans
-from retwin.report.labels import number, quantity
+from retwin.report.labels import number
 from retwin.report.study import Study
 from retwin.scores.segments import SegmentError, clearest_segment, median_error_trajectory
+
+Limits = tuple[float, float]
+Values = dict[str, NDArray]
 
 
 @dataclass(frozen=True)
@@ -52,19 +54,16 @@ class Segment:
 
 def segment(study: Study) -> Segment | None:
     """The clearest segment of the healthy test trajectory with the median error."""
-    if study.results.overlay is None or "portrait/bands" not in study.arrays:
+    portrait = study.portrait
+    if not portrait:
         return None
-    nominal, observed, times = (
-        study.arrays[f"portrait/{name}"] for name in ("nominal", "observed", "times")
-    )
-    labels = np.array(study.results.data.test.labels)
-    healthy = labels == HEALTHY if HEALTHY in labels else np.ones(len(labels), dtype=bool)
+    nominal, observed, times = (portrait[name] for name in ("nominal", "observed", "times"))
+    healthy = study.healthy if study.healthy.any() else np.ones(len(nominal), dtype=bool)
     place = median_error_trajectory(nominal, observed, times, healthy)
     if place is None:
         return None
-    rate = float(study.arrays["portrait/rate"])
-    outputs = study.results.outputs
-    scale = np.array([quantity(unit)[0] for unit in outputs.units])
+    rate, units = float(portrait["rate"]), study.output_quantities
+    scale = np.array([factor for factor, _ in units])
     both = scale * nominal[place], scale * observed[place]
     error = clearest_segment(*both, times[place], rate)
     if error is None:
@@ -72,8 +71,8 @@ def segment(study: Study) -> Segment | None:
     known = times[place][np.isfinite(times[place]).all(axis=1)]
     return Segment(
         study.results.data.test.ids[place],
-        outputs.names[error.output],
-        quantity(outputs.units[error.output])[1],
+        study.results.outputs.names[error.output],
+        units[error.output][1],
         np.arange(nominal.shape[1]) / rate,
         both[0][:, error.output],
         both[1][:, error.output],
@@ -84,53 +83,40 @@ def segment(study: Study) -> Segment | None:
 
 def segment_figure(found: Segment) -> Figure:
     """The whole trajectory, the segment with TDe, and the difference in it with TPE."""
-    error = found.error
+    error, output = found.error, found.output
     tde, tpe = found.labels
-    window = error.onset, error.end
-    difference = found.observed - found.nominal
+    whole, window = (float(found.time[0]), float(found.time[-1])), (error.onset, error.end)
+    both = {"nominal": found.nominal, "measured": found.observed}
     delay = Dimension(*error.midpoints, "delay", (64, 24))
     offset = Dimension((error.settle, error.offset), (error.end, error.offset), "offset", (0, -40))
+
+    missed = {"measured": found.observed - found.nominal}
+
+    def panel(
+        title: str, alt: str, limits: Limits, name: str, values: Values, *marks: Mark
+    ) -> Panel:
+        drawn = [*_lines(found, values, limits), *marks]
+        return Panel(Axis("time", "s", limits), [Row(Axis(name, found.unit), drawn)], alt, title)
+
+    shown = [delay] if math.isfinite(error.delay) else []
+    alt = f"{output} in one segment, {tde}"
     panels = [
-        Panel(
-            Axis("time", "s", limits),
-            [Row(Axis(label, found.unit), [*_lines(found, values, limits), *marks])],
-            alt,
-            title,
-        )
-        for limits, label, values, marks, alt, title in (
-            (
-                (float(found.time[0]), float(found.time[-1])),
-                found.output,
-                {"nominal": found.nominal, "measured": found.observed},
-                [],
-                f"{found.output} over the whole trajectory",
-                "Whole trajectory",
-            ),
-            (
-                window,
-                found.output,
-                {"nominal": found.nominal, "measured": found.observed},
-                [delay] if math.isfinite(error.delay) else [],
-                f"{found.output} in one segment, {tde}",
-                f"One segment: {tde}",
-            ),
-            (
-                window,
-                f"{found.output} minus nominal",
-                {"measured": difference},
-                [offset],
-                f"Residual in the same segment, {tpe}",
-                f"Residual in this segment: {tpe}",
-            ),
-        )
+        panel("Whole trajectory", f"{output} over the whole trajectory", whole, output, both),
+        panel(f"One segment: {tde}", alt, window, output, both, *shown),
+        panel(
+            f"Residual in this segment: {tpe}",
+            f"Residual in the same segment, {tpe}",
+            window,
+            f"{output} minus nominal",
+            missed,
+            offset,
+        ),
     ]
     keys = [Key("measured", "ink"), Key("nominal", "muted", "dot"), Key("in motion", "grid", "bar")]
     return Figure("movement", panels, keys)
 
 
-def _lines(
-    found: Segment, values: dict[str, NDArray], limits: tuple[float, float]
-) -> Sequence[Mark]:
+def _lines(found: Segment, values: Values, limits: Limits) -> Sequence[Mark]:
     """The values within the limits, above shading where there is motion."""
     start, end = limits
     inside = (found.time >= start) & (found.time <= end)

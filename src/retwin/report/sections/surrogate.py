@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from retwin.report.blocks import Cell, Section, Table, columns
+from retwin.report.blocks import Section, tabulate
 from retwin.report.labels import number, quantity, with_unit
 from retwin.report.sections.discrepancy import latents
 from retwin.report.study import Study
@@ -14,14 +14,12 @@ def surrogate(study: Study) -> Section | None:
     if not error.rmse:
         return None
     factor, unit = quantity(error.unit)
-    heads = columns("Output", with_unit("RMSE", unit), *(["NRMSE, %"] if error.nrmse else []))
-    rows = []
+    heads, rows = ["Output", with_unit("RMSE", unit)], []
+    heads += ["NRMSE, %"] if error.nrmse else []
     for name, value in error.rmse.items():
-        row = [Cell(name), Cell(number(factor * value))]
-        if error.nrmse:
-            relative = error.nrmse.get(name)
-            row.append(Cell("–" if relative is None else number(100 * relative, 2)))
-        rows.append(row)
+        relative = error.nrmse.get(name)
+        both = number(factor * value), number(None if relative is None else 100 * relative, 2)
+        rows.append([name, *both][: len(heads)])
     compared = any(latents(study, source) for source in study.results.fidelity)
-    values = {"table": Table("Error of the surrogate", heads, rows), "compared": compared}
+    values = {"table": tabulate("Error of the surrogate", heads, rows), "compared": compared}
     return Section("surrogate", "Surrogate error", values)

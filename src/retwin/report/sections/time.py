@@ -1,0 +1,69 @@
+"""The costs of each source in twin runs and seconds, and the duration of the stages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from retwin.report.blocks import Cell, Column, Section, Table, tabulate, text_column
+from retwin.report.labels import duration, real_data, source_name, stage_name
+from retwin.report.study import Study
+from retwin.source_results import SourceResults
+
+PUBLISHED_BULK, BULK = 3600, 1000
+"""The number of trajectories to which generation times refer: in the paper, and elsewhere."""
+
+
+def time(study: Study) -> Section | None:
+    """The costs of the sources, and the duration of the stages."""
+    costs, stages = _costs(study), _stages(study)
+    if costs is None and stages is None:
+        return None
+    paper = costs is not None and any(column.paper for column in costs.columns)
+    return Section("time", "Time", {"costs": costs, "stages": stages, "paper": paper})
+
+
+def _stages(study: Study) -> Table | None:
+    timing = study.results.timing
+    seconds = timing.get("seconds")
+    named = {
+        **{stage_name(key): value for key, value in (seconds or {}).items()},
+        "All jobs": timing.get("total_s"),
+    }
+    rows = [
+        [name, duration(float(value))]
+        for name, value in named.items()
+        if isinstance(value, int | float) and math.isfinite(value)
+    ]
+    return tabulate("Time of the stages", ["Stage", "Time"], rows) if rows else None
+
+
+def _costs(study: Study) -> Table | None:
+    count = PUBLISHED_BULK if study.results.published else BULK
+    bulk = f"{count} trajectories"
+    classes = bool(study.results.classes)
+    shown: dict[str, Callable[[SourceResults], str]] = {
+        "Twin runs": lambda each: "–" if each.twin_runs is None else str(each.twin_runs),
+        "Update": lambda each: duration(each.update_s),
+        bulk: lambda each: duration(each.generation_seconds(count)),
+        "Training": lambda each: duration(each.train_s),
+        "One diagnosis": lambda each: duration(each.predict_s),
+    }
+    known = {name: list(map(text, study.sources.values())) for name, text in shown.items()}
+    kept = {name: texts for name, texts in known.items() if set(texts) != {"–"}}
+    if not kept:
+        return None
+    heads: list[object] = ["Training data" if classes else "Source"]
+    heads.append(text_column(f"{study.word.capitalize()} data used"))
+    names = [Cell(source_name(source), source=source) for source in study.sources]
+    used = [real_data(each.real_data, classes=classes) for each in study.sources.values()]
+    found: list[Sequence[object]] = [names, used]
+    published = [study.results.published.get(s, {}).get("generate", "–") for s in study.sources]
+    for name, texts in kept.items():
+        if name == bulk and set(published) != {"–"}:
+            heads += [Column("this study", group=bulk), Column("paper", group=bulk, paper=True)]
+            found += [texts, published]
+        else:
+            heads.append(name)
+            found.append(texts)
+    return tabulate("Cost of a source in one run", heads, zip(*found, strict=True))
