@@ -54,7 +54,8 @@ class Training:
     weight_decay : float
         Weight decay of AdamW.
     clip : float
-        Largest norm of the gradient of all parameters together; 0 does not clip.
+        Largest norm of the gradient of all parameters together, of an ensemble those of each
+        member; 0 does not clip.
 
     Raises
     ------
@@ -208,10 +209,12 @@ class _Optimiser:
     """AdamW with its schedule over `steps` steps and the clipping of gradients."""
 
     def __init__(self, network: nn.Module, how: Training, *, steps: int) -> None:
-        self.parameters = list(network.parameters())
+        # Members of an ensemble are clipped alone: the gradients of one say nothing of another.
+        alone = network if isinstance(network, nn.ModuleList) else [network]
+        self.parts = [list(each.parameters()) for each in alone]
         self.clip = how.clip
         self.adam = AdamW(
-            self.parameters, how.learning_rate, weight_decay=how.weight_decay, fused=True
+            network.parameters(), how.learning_rate, weight_decay=how.weight_decay, fused=True
         )
         self.schedule: LRScheduler
         if how.decay == "cosine":
@@ -225,8 +228,8 @@ class _Optimiser:
         """One step down the gradient of `loss`."""
         self.adam.zero_grad()
         loss.backward()
-        if self.clip:
-            nn.utils.clip_grad_norm_(self.parameters, self.clip)
+        for part in self.parts if self.clip else ():
+            nn.utils.clip_grad_norm_(part, self.clip)
         self.adam.step()
         self.schedule.step()
 

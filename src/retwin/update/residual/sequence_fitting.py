@@ -129,12 +129,12 @@ def _train_members(
     """Train all members together to the last epoch on their samples `fitted` (K, n, T).
 
     Held-out parts do not stop the training early, since members are calibrated on them. The loss is
-    a sum over members, so that gradients are those of each alone; the clipping is in proportion.
+    a sum over members, so that gradients are those of each alone.
     """
     how, windows = model.density.training, data.windows(model.density, fitted)
     epochs = model.density.max_steps * how.batch_size // len(windows[0])
     epochs = min(how.max_epochs, max(1, epochs))
-    how = replace(how, max_epochs=epochs, clip=how.clip * len(fitted) ** 0.5)
+    how = replace(how, max_epochs=epochs)
     return train(model.members, _objective(model), windows, None, how, seed=seed, progress=progress)
 
 
