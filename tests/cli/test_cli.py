@@ -316,7 +316,7 @@ def test_a_study_of_a_case_of_ones_own(call, own: Path, words: tuple) -> None:
     [
         ((), "either --real or --data, got none"),
         (("--real", "a", "--data", "b"), "either --real or --data, got both"),
-        (("--data", "gone.csv"), "gone.csv: expected a CSV file with a header"),
+        (("--data", "gone.csv"), "gone.csv: expected a table of text, got No such file"),
         (("--data", "record.csv", "--refine"), "--refine: expected a density of one z"),
         (("--data", "record.csv", "--density", "flow"), "density: expected SequenceMixture, for"),
         (("--data", "record.csv", "--network", "gru"), "network: expected one of mlp, lstm"),

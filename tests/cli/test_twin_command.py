@@ -403,7 +403,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     refused(call, "from 0 to 1000", *far, "--out", out / "a.zarr")
     refused(call, r"\.npz or \.zarr", "simulate", "armpi-kinematic", "--out", out / "a.csv")
     narrow = ("--commands", tmp_path / "far.npz", "--out", out / "a.zarr")
-    refused(call, "inputs of the twin|rate of the twin", "simulate", f"{mine}:LIMITED", *narrow)
+    refused(call, "inputs of the twin|that of the twin", "simulate", f"{mine}:LIMITED", *narrow)
     for function, match in (("flat", "to return numbers of shape"), ("holes", "finite numbers")):
         words = (f"{mine}:{function}", "--inputs=u", "--outputs=y", "--rate=50")
         rt.save(twins.get(f"{mine}:LIMITED").simulate(np.ones((3, 9, 1)), seed=0), out / "u.npz")

@@ -11,8 +11,8 @@ import torch
 
 import retwin as rt
 from retwin import compiler
-from retwin import threads as divided
 from retwin.twins import State, StateTwin
+from retwin.workers import threads as divided
 
 LAG = StateTwin(
     (State("level", "V"),),

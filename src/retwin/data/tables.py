@@ -193,7 +193,7 @@ def read_titled(path: Path, wanted: Sequence[str]) -> Table:
         raise InputError(
             str(path),
             expected="a table of text",
-            got=f"{type(error).__name__}: {brief(error)}",
+            got=getattr(error, "strerror", None) or f"{type(error).__name__}: {brief(error)}",
             remedy="check the name of the file, and that it is the right one",
         ) from None
 

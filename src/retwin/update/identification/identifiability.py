@@ -32,9 +32,9 @@ BLOCKS = 8
 SHARED = 0.5
 """Share of the information on a direction that one block may have: beyond it, as with the start of
 a state, sums over blocks say nothing of the error."""
-COPY, COMPARED = 0.999, 10
-"""Correlation of the residuals of two trajectories from which one is a copy of the other, and the
-samples of a trajectory below which that is not compared."""
+COPY, COMPARED = 1e-5, 10
+"""Largest difference of the outputs of two trajectories, in standard deviations, up to which one is
+a copy of the other, and the samples of a trajectory below which that is not compared."""
 MAX_AUTOCORRELATION = 0.999
 """Largest lag-one autocorrelation, which bounds the correlation time at 1999 samples."""
 
@@ -272,16 +272,25 @@ def blocks_of(residual: NDArray) -> NDArray:
     return np.asarray(np.minimum(own, number - 1) + number * np.arange(len(residual))[:, None])
 
 
-def distinct(residual: NDArray) -> NDArray:
-    """Indices of the trajectories whose residuals (n, P, d_y) are no copy of an earlier one's."""
-    if residual.shape[1] < COMPARED:
-        return np.arange(len(residual))
-    seen = residual != 0
-    mean = residual.sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1)
-    flat = np.where(seen, residual - mean, 0.0).reshape(len(residual), -1)
-    size = np.linalg.norm(flat, axis=1)
-    alike = flat @ flat.T / np.maximum(np.outer(size, size), 1e-300)
-    return np.flatnonzero(np.tril(alike, -1).max(axis=1, initial=0.0) < COPY)
+def distinct(measured: NDArray) -> NDArray:
+    """Indices of the trajectories whose outputs (n, P, d_y) are no copy of an earlier one's.
+
+    NaN is what was not measured. Replicates of one program differ by their noise, copies do not.
+    """
+    count = np.isfinite(measured).sum(axis=(1, 2))
+    spread = np.nanstd(measured, axis=(0, 1))
+    mean = np.nansum(measured, axis=(1, 2)) / np.maximum(count, 1)
+    order = [i for i in np.argsort(mean, kind="stable") if count[i] >= COMPARED]
+    copies = set()
+    for place, i in enumerate(order):
+        for j in order[place - 1 :: -1] if place else ():
+            if mean[i] - mean[j] > COPY * spread.sum():
+                break
+            apart = np.nan_to_num(np.abs(measured[i] - measured[j])).max(axis=0)
+            alike = (np.isnan(measured[i]) == np.isnan(measured[j])).all()
+            if alike and (spread > 0).any() and (apart <= COPY * spread).all():
+                copies.add(max(i, j))
+    return np.array([i for i in range(len(measured)) if i not in copies])
 
 
 def standard_errors(jacobian: NDArray, residual: NDArray) -> NDArray:

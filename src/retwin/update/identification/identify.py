@@ -304,7 +304,7 @@ def _fitted(
     optima = search.run(np.random.default_rng(misfit.seed))
     best, point = optima[0]
     residual = misfit.residuals(np.array([best.values]))[0]
-    once = distinct(residual)
+    once = distinct(np.where(misfit.seen, misfit.measured, np.nan))
     found, errors, agreeing = _identifiability(search, optima, point, residual, once)
     # Starts draw all parameters; one without effect has no other value than the present one.
     kept = np.where(found.effects > 0, best.values, twin.values)

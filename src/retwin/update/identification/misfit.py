@@ -46,6 +46,8 @@ class Misfit:
 
     Attributes
     ----------
+    measured : NDArray
+        (n, P, d_y), the outputs in physical units.
     seen : NDArray
         (n, P, d_y) bool, the measured samples.
     unit : NDArray
@@ -88,7 +90,7 @@ class Misfit:
         self._processes = processes
         self.windows = windows
         self._commands = observed.commands.astype(np.float64)
-        self._measured = observed.observed[:, ::stride].astype(np.float64)
+        self.measured = observed.observed[:, ::stride].astype(np.float64)
         self.present = self.outputs(np.array([twin.values]))[0]
         if np.isnan(self.present).any():
             with suppress(SimulationError):  # what the twin itself refuses has a better message
@@ -135,7 +137,7 @@ class Misfit:
 
     def residuals_of(self, outputs: NDArray) -> NDArray:
         """Residuals (m, n, P, d_y) of simulated outputs; 0 where nothing was measured."""
-        return np.where(self.seen, (self._measured - outputs) / self.unit, 0.0)
+        return np.where(self.seen, (self.measured - outputs) / self.unit, 0.0)
 
     def derivatives(self, theta: NDArray) -> NDArray | None:
         """Derivatives (n P d_y, k) of the residuals at parameters (k,).
