@@ -275,20 +275,22 @@ def blocks_of(residual: NDArray) -> NDArray:
 def distinct(measured: NDArray) -> NDArray:
     """Indices of the trajectories whose outputs (n, P, d_y) are no copy of an earlier one's.
 
-    NaN is what was not measured. Replicates of one program differ by their noise, copies do not.
+    NaN is what was not measured. Replicates of one program differ by their noise, copies do not;
+    outputs that never change are no evidence of a copy.
     """
-    count = np.isfinite(measured).sum(axis=(1, 2))
-    spread = np.nanstd(measured, axis=(0, 1))
+    seen = np.isfinite(measured)
+    count, spread = seen.sum(axis=(1, 2)), np.nanstd(measured, axis=(0, 1))
+    ends = np.where(seen, measured, np.inf).min(1), np.where(seen, measured, -np.inf).max(1)
+    moves = (ends[1] - ends[0] > COPY * spread).any(axis=1)
     mean = np.nansum(measured, axis=(1, 2)) / np.maximum(count, 1)
-    order = [i for i in np.argsort(mean, kind="stable") if count[i] >= COMPARED]
+    order = [i for i in np.argsort(mean, kind="stable") if count[i] >= COMPARED and moves[i]]
     copies = set()
     for place, i in enumerate(order):
         for j in order[place - 1 :: -1] if place else ():
             if mean[i] - mean[j] > COPY * spread.sum():
                 break
             apart = np.nan_to_num(np.abs(measured[i] - measured[j])).max(axis=0)
-            alike = (np.isnan(measured[i]) == np.isnan(measured[j])).all()
-            if alike and (spread > 0).any() and (apart <= COPY * spread).all():
+            if (seen[i] == seen[j]).all() and (apart <= COPY * spread).all():
                 copies.add(max(i, j))
     return np.array([i for i in range(len(measured)) if i not in copies])
 
