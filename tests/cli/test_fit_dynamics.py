@@ -210,6 +210,21 @@ def test_states_that_the_twin_has_not_are_refused_when_the_case_is_read(folder: 
         rt.cases.get(str(file))
 
 
+def test_an_interrupt_of_the_yardstick_leaves_the_model(
+    folder: Path, tmp_path: Path, call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("retwin.evaluation.choice.fitting.with_yardstick", interrupt)
+    out = tmp_path / "model"
+    given = ("--data", folder / "d.csv", "--dynamics", "--no-compare", "--yardstick", "--out", out)
+    code, _, err = call("fit", folder / "case.toml", *given)
+    assert code == 130
+    assert f"interrupted; {out} stays as it was saved, not compared" in err.splitlines()[-1]
+    assert rt.load_twin(out).outputs.names == ("level",)
+
+
 @pytest.mark.slow
 def test_without_a_method_the_records_decide(folder: Path, tmp_path: Path, call) -> None:
     case, out = folder / "case.toml", tmp_path / "model"

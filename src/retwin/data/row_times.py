@@ -78,14 +78,14 @@ def row_times(values: NDArray, unit: str, clock: Clock, where: str) -> NDArray:
         )
         return values.astype("datetime64[ns]").astype(np.int64)
     if clock.format or clock.unit == "iso":
-        return _parsed(values, clock.format, where)
+        return _parse(values, clock.format, where)
     if values.dtype.kind in "OUS":
         found = [_number(str(cell)) for cell in values]
         if None in found:
             row = found.index(None)
             if clock.unit or row:  # the others are numbers
                 raise _no_time(values[row], f"{where}, row {row}")
-            return _parsed(values, "", where)
+            return _parse(values, "", where)
         values = np.array(found, dtype=object)
     stated = clock.unit or SPELT.get(unit, unit)
     if stated not in NANOSECONDS:
@@ -129,7 +129,7 @@ def _number(cell: str) -> Decimal | None:
         return None
 
 
-def _parsed(cells: NDArray, form: str, where: str) -> NDArray:
+def _parse(cells: NDArray, form: str, where: str) -> NDArray:
     """Times in ns of ISO 8601 text, or of text in a format of `strptime`; UTC without a zone.
 
     Without a format, other dates are read too if one of `DATES` fits to all.

@@ -123,7 +123,7 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "verdict": verdict(study),
     }
 
-    def filled(name: str, values: Mapping[str, Any]) -> Markup:
+    def fill(name: str, values: Mapping[str, Any]) -> Markup:
         """A part with its terms explained, and no line break before a percent sign."""
         text = templates.get_template(f"{name}.html.j2").render(values)
         return Markup(re.sub(r"(?<=\d) (?=%)", "\u00a0", explained(text)))
@@ -133,7 +133,7 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "page",
         [*front, *(figure for each in sections for figure in each.figures)],
         sections=sections,
-        bodies={section.key: filled(section.key, section.values) for section in sections},
-        summary=filled("summary", {"summary": found}) if found else "",
+        bodies={section.key: fill(section.key, section.values) for section in sections},
+        summary=fill("summary", {"summary": found}) if found else "",
         scripts={name: value for each in sections for name, value in each.scripts.items()},
     )

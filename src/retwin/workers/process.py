@@ -167,7 +167,7 @@ class ForeignProcess:
         except EOFError:
             if self._late:
                 raise TimeoutError from None
-            raise self._ended() from None
+            raise self._describe_end() from None
         except InputError:
             raise
         except (ValueError, TypeError, LookupError):
@@ -185,7 +185,7 @@ class ForeignProcess:
         timer.start()
         return timer
 
-    def _ended(self) -> ProcessEnded:
+    def _describe_end(self) -> ProcessEnded:
         """How the process ended, which has closed its connection."""
         try:
             code = self._process.wait(CLOSING_TIME)

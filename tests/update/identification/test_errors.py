@@ -57,7 +57,7 @@ def fitted(slopes: NDArray, outputs: NDArray) -> tuple[NDArray, NDArray, Identif
 
 @pytest.mark.parametrize("kind", BREAKS)
 def test_intervals_hold_the_value_of_unlimited_data(kind: str) -> None:
-    """Of 300 records; without blocks, 0.77 of the gains beside a cubic term are inside."""
+    """Of 300 records; without blocks, 0.49 of the gains beside a cubic term are inside."""
     limit = TRUE if kind in ("right", "coloured") else fitted(*record(kind, 400_000, 1))[0]
     inside = np.zeros(3)
     for seed in range(300):

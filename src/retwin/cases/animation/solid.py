@@ -177,14 +177,14 @@ class _Scene:
     def picture(self, nominal: NDArray, observed: NDArray) -> NDArray:
         """The picture (height, width, 4) of nominal and observed joints in rad or m."""
         # The ghost is behind the solid body: two surfaces in one place would flicker.
-        ghost, solid = self._rendered(nominal, self._ghost), self._rendered(observed, self._solid)
+        ghost, solid = self._render(nominal, self._ghost), self._render(observed, self._solid)
         paper = np.round(255 * np.array(PAPER))
         behind, there = (np.abs(each - paper).max(axis=2) > 2 for each in (ghost, solid))
         opacity = np.where(there, 1, GHOST_OPACITY * behind)
         colour = np.where(there[..., None], solid, ghost)
         return np.concatenate([colour, 255 * opacity[..., None]], axis=2).astype(np.uint8)
 
-    def _rendered(self, joints: NDArray, look: tuple[NDArray, NDArray]) -> NDArray:
+    def _render(self, joints: NDArray, look: tuple[NDArray, NDArray]) -> NDArray:
         """The picture (height, width, 3) of the body in a pose."""
         self._data.qpos[self._addresses] = joints
         self._model.geom_rgba[:], self._model.geom_matid[:] = look

@@ -123,7 +123,7 @@ def grid_chain(plane: Plane, paths: NDArray) -> Explanations:
             guess[pair], move, new[pair], COMBINATIONS[combination], cost[pair, combination]
         )
         guesses = _best(plane, more, GRID_GUESSES, 4.0)
-    return _decided(plane, guesses)
+    return _decide(plane, guesses)
 
 
 def free_chain(plane: Plane, paths: NDArray, effort: int = 1) -> Explanations:
@@ -168,7 +168,7 @@ def free_chain(plane: Plane, paths: NDArray, effort: int = 1) -> Explanations:
         more = more.join(guesses.extend(lost, move, guesses.postures[lost, move], 0, 0.0))
         guesses = _best(plane, more, KEPT_GUESSES * effort, 4.0)
     _refine(plane, guesses, on_grid, moves, 4)
-    return _decided(plane, guesses)
+    return _decide(plane, guesses)
 
 
 def _best(plane: Plane, guesses: Explanations, number: int, margin: float) -> Explanations:
@@ -182,7 +182,7 @@ def _best(plane: Plane, guesses: Explanations, number: int, margin: float) -> Ex
     return guesses.rows(order[close & (np.arange(path.size) - begin < number)])
 
 
-def _decided(plane: Plane, found: Explanations) -> Explanations:
+def _decide(plane: Plane, found: Explanations) -> Explanations:
     """The best explanation of each path; movements that another one explains as well are tied."""
     total = found.cost.sum(axis=1)
     order = np.lexsort((total, found.path))

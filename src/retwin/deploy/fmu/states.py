@@ -30,7 +30,7 @@ def states_text(twin: StateTwin | DynamicsTwin | CorrectedTwin) -> Text:
 
     """
     ranged = isinstance(twin, DynamicsTwin)
-    corrected = twin if isinstance(twin, DynamicsTwin) else _as_corrected(twin)
+    corrected = twin if isinstance(twin, DynamicsTwin) else _convert(twin)
     interpolation = corrected.equations.interpolation
     require(
         interpolation != "spline",
@@ -50,7 +50,7 @@ def states_text(twin: StateTwin | DynamicsTwin | CorrectedTwin) -> Text:
     )
 
 
-def _as_corrected(given: StateTwin | CorrectedTwin) -> DynamicsTwin:
+def _convert(given: StateTwin | CorrectedTwin) -> DynamicsTwin:
     """The equations as corrected dynamics without discrepancy, and with white noise if any."""
     if isinstance(given, StateTwin):
         twin, values, noise = given, given.values(None, 1)[0], np.zeros(len(given.outputs))

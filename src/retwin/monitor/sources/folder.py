@@ -102,7 +102,7 @@ class Folder(Files):
         self._layouts = layouts
         self._tables: dict[tuple[str, str], GrowingTable] = {}
 
-    def _changed(self, asset: str, paths: list[str]) -> list[GrowingTable]:
+    def _list_changed(self, asset: str, paths: list[str]) -> list[GrowingTable]:
         """The files of a machine that were written to, in the order of their new rows."""
         for key in [key for key in self._tables if key[0] == asset and key[1] not in paths]:
             del self._tables[key]
@@ -121,7 +121,7 @@ class Folder(Files):
         return [table for _, _, table in sorted(found, key=lambda each: each[:2])]
 
     def _read(self, asset: str, paths: list[str], gate: Gate, stop: threading.Event) -> None:
-        for table in self._changed(asset, paths):
+        for table in self._list_changed(asset, paths):
             try:
                 for rows in table.rows():
                     for reason in rows.bad:

@@ -226,7 +226,7 @@ class Csv(GrowingTable):
                 text = chunk[: chunk.rfind(b"\n") + 1]
                 if len(chunk) == CHUNK and not text:
                     raise ValueError(f"a row of more than {CHUNK} bytes")
-                made = self._parsed(text, place) if text else None
+                made = self._parse(text, place) if text else None
                 if made is None:
                     return
                 place = made.end
@@ -238,7 +238,7 @@ class Csv(GrowingTable):
         file.seek(place.offset - len(place.tail))
         return place if file.read(len(place.tail)) == place.tail else _Place()
 
-    def _parsed(self, text: bytes, place: _Place) -> Rows | None:
+    def _parse(self, text: bytes, place: _Place) -> Rows | None:
         """Complete lines after a place; None if they hold no row yet."""
         layout, name = place.layout, self.path.name
         encoding = layout.encoding if layout else encoding_of(text)

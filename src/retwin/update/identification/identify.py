@@ -74,8 +74,7 @@ class Updated:
     figures : dict of str to float
         `rms_before` and `rms_after` in output units (relative to each output's standard deviation
         where units differ), `measurements`, `independent`, the effective sample size,
-        `copies`, the trajectories that repeat another one, and
-        `starts_agreeing`.
+        `copies`, the trajectories that repeat another one, and `starts_agreeing`.
     reason : str
         Why the search ended, and the warnings.
     loss : str

@@ -11,7 +11,7 @@ from scipy import stats
 from retwin.checks import one_of, whole
 from retwin.data.measured import measured_only
 from retwin.data.trajectories import Trajectories
-from retwin.update.identification.identifiability import CHI2_95, variance_of
+from retwin.update.identification.identifiability import variance_of
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.misfit import misfit_of
 from retwin.update.identification.search import LeastSquares, Search
@@ -38,7 +38,7 @@ class Profile:
         fit leaves and its autocorrelation.
     limit : float
         A value is in the 95 % interval where `rise` is below it: the square of the quantile of
-        Student's t distribution that belongs to the standard error, or else 3.84.
+        Student's t distribution that belongs to the standard error.
 
     """
 
@@ -100,8 +100,8 @@ def profile(
     one_of("name", name, names)
     whole("points", points, least=3)
     which, observed = names.index(name), measured_only(observed)
-    local, limit = updated.identifiability, CHI2_95
-    error = local.errors[which]
+    local = updated.identifiability
+    error, limit = local.errors[which], stats.t.ppf(0.975, local.freedom[which]) ** 2
     if np.isfinite(updated.errors[name]):
         error = updated.errors[name]
         limit = stats.t.ppf(0.975, len(observed) - 1) ** 2

@@ -219,15 +219,12 @@ class SequenceResidual(Residual):
         standard = self.before(features)
         encoded = [member.encoder(standard) for member in members]
         made = []
-        for block, unit in enumerate(zip(*self._units, strict=True)):
+        units = zip(self.shift.split(self.sizes), self.scale.split(self.sizes), strict=True)
+        for block, unit in enumerate(units):
             heads = [member.heads[block] for member in members]
             raw = [head.linear(each) for head, each in zip(heads, encoded, strict=True)]
             made.append(heads[0].mixture(torch.stack(raw), *unit))
         return made
-
-    @property
-    def _units(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        return self.shift.split(self.sizes), self.scale.split(self.sizes)
 
     @torch.no_grad()
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
