@@ -31,7 +31,7 @@ def test_heat_is_conserved_at_rest() -> None:
 
 @pytest.mark.slow
 @pytest.mark.real_data
-@pytest.mark.filterwarnings("ignore:not identified")
+@pytest.mark.filterwarnings("ignore:not identified|at a bound")
 def test_four_parameters_follow_the_real_incubator_to_a_kelvin() -> None:
     """The start is inferred from the first 120 s, and the rest simulated (docs/results.md)."""
     folder = Path(os.environ.get("RETWIN_DATA", "")) / "incubator"
