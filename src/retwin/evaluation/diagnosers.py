@@ -36,7 +36,9 @@ def evaluate(diagnoser: Diagnoser, test: Trajectories) -> Scores:
 
     """
     instance("test", test, Trajectories, remedy="load recorded ones, or simulate a twin")
-    return scored(test, finite_probabilities(diagnoser, test), diagnoser.classes)
+    probabilities = diagnoser.predict_proba(test)
+    check_probabilities(test, probabilities)
+    return scored(test, probabilities, diagnoser.classes)
 
 
 def scored(test: Trajectories, probabilities: NDArray, classes: Sequence[str]) -> Scores:
@@ -48,34 +50,18 @@ def scored(test: Trajectories, probabilities: NDArray, classes: Sequence[str]) -
     return score(truth, probabilities, classes)
 
 
-def finite_probabilities(diagnoser: Diagnoser, trajectories: Trajectories) -> NDArray:
-    """Class probabilities that can be scored.
+def check_probabilities(trajectories: Trajectories, probabilities: NDArray) -> None:
+    """Check that probabilities (n, classes) of trajectories can be scored.
 
-    Parameters
-    ----------
-    diagnoser : Diagnoser
-        It predicts without the labels.
-    trajectories : Trajectories
-        n trajectories.
-
-    Returns
-    -------
-    NDArray
-        Probabilities (n, classes), all finite.
-
-    Raises
-    ------
-    InputError
-        If a probability is not finite, because its largest would be taken for a class.
-
+    Raises InputError if one is not finite, because its largest would be taken for a class.
     """
-    probabilities = diagnoser.predict_proba(trajectories)
     failed = trajectories.ids[~np.isfinite(probabilities).all(axis=1)].tolist()
+    more = f" and {len(failed) - 5} more" if len(failed) > 5 else ""
     require(
         not failed,
         "probabilities",
         expected="finite probabilities from the diagnoser",
-        got=f"{len(failed)} trajectories with others, such as {', '.join(failed[:5])}",
-        remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser anew",
+        got=f"NaN for {', '.join(failed[:5])}{more}",
+        remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser anew "
+        "if it gives NaN for others too",
     )
-    return probabilities
