@@ -329,18 +329,12 @@ def _row(
 
 def _shown(comparison: Comparison, name: str) -> tuple[NDArray, NDArray]:
     """Predictions (n, T, d_y) of the parts in time that were left out, and their deviations."""
-    shape = comparison.records.observed.shape
-    mean, deviation = np.full(shape, np.nan), np.full(shape, np.nan)
     if name not in comparison.predicted:
-        return mean, deviation
-    measured = comparison.records.observed
-    for i, fold in enumerate(comparison.folds):
-        if not fold.edge:
-            rows, held = fold.rows, fold.held[fold.rows][..., None]
-            made = measured[rows] - comparison.errors(name, i)
-            mean[rows] = np.where(held, made, mean[rows])
-            deviation[rows] = np.where(held, comparison.deviation(name, i), deviation[rows])
-    return mean, deviation
+        nothing = np.full(comparison.records.observed.shape, np.nan)
+        return nothing, nothing
+    observed, folds = comparison.records.observed, comparison.folds
+    mean = comparison.joined(lambda i: observed[folds[i].rows] - comparison.errors(name, i))
+    return mean, comparison.joined(lambda i: comparison.deviation(name, i))
 
 
 def _parameters(whole: Candidates, model: Model) -> dict[str, tuple[float, float, float]]:

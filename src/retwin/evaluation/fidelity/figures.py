@@ -155,11 +155,8 @@ class Fidelity:
         arrays: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in padded]) for name in _KEYS
         }
-        rivals = {
-            name: (
-                np.concatenate([part.rivals[name][0] for part in parts]),
-                np.concatenate([part.rivals[name][1] for part in parts]),
-            )
+        rivals: dict[str, Any] = {
+            name: tuple(map(np.concatenate, zip(*(p.rivals[name] for p in parts), strict=True)))
             for name in parts[0].rivals
         }
         return replace(parts[0], rivals=rivals, **arrays)
