@@ -9,9 +9,8 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from retwin import catalog, twins
+from retwin import cases, catalog, twins
 from retwin.cases.case import Case
-from retwin.cases.file import read_case
 from retwin.cases.named_twin import parametric_twin
 from retwin.checks import nothing, require
 from retwin.errors import InputError
@@ -125,8 +124,9 @@ def open_parametric(
         given twice, or its range does not contain its start.
 
     """
-    case = _case(name)
-    if case is not None:
+    toml, case = Path(name).suffix.lower() == ".toml", None
+    if toml or name in catalog.CASES:
+        case = cases.get(name)
         given = (*inputs, *outputs, *([f"{rate:g} Hz"] if rate is not None else []))
         expected = "none of them, since the case has its own"
         nothing("inputs, outputs, rate", given, expected, remedy="leave them out")
@@ -138,15 +138,6 @@ def open_parametric(
     known = tuple(_known(twin))
     made = _freed(twin, _chosen(known, free, name))
     return OpenedTwin(name, made, known, case, not (inputs or outputs or rate))
-
-
-def _case(name: str) -> Case | None:
-    """The case of that name; None if the name is that of a twin."""
-    if Path(name).suffix.lower() == ".toml":
-        return read_case(name)
-    if name not in catalog.CASES:
-        return None
-    return catalog.resolve(catalog.CASES[name].target)()
 
 
 def _known(twin: Twin) -> Iterator[Known]:
