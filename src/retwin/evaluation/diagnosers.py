@@ -36,9 +36,7 @@ def evaluate(diagnoser: Diagnoser, test: Trajectories) -> Scores:
 
     """
     instance("test", test, Trajectories, remedy="load recorded ones, or simulate a twin")
-    probabilities = diagnoser.predict_proba(test)
-    check_probabilities(test, probabilities)
-    return scored(test, probabilities, diagnoser.classes)
+    return scored(test, finite_probabilities(diagnoser, test), diagnoser.classes)
 
 
 def scored(test: Trajectories, probabilities: NDArray, classes: Sequence[str]) -> Scores:
@@ -48,6 +46,13 @@ def scored(test: Trajectories, probabilities: NDArray, classes: Sequence[str]) -
     nothing("test", sorted(unknown), f"labels among {', '.join(classes)}", remedy=remedy)
     truth = np.array([list(classes).index(label) for label in test.labels])
     return score(truth, probabilities, classes)
+
+
+def finite_probabilities(diagnoser: Diagnoser, trajectories: Trajectories) -> NDArray:
+    """Probabilities (n, classes) of a diagnoser that can be scored; see `check_probabilities`."""
+    probabilities = diagnoser.predict_proba(trajectories)
+    check_probabilities(trajectories, probabilities)
+    return probabilities
 
 
 def check_probabilities(trajectories: Trajectories, probabilities: NDArray) -> None:
