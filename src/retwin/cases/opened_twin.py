@@ -62,6 +62,11 @@ class Known:
         inside = self.value is None or self.low <= self.value <= self.high
         return inside and isfinite(self.low) and isfinite(self.high)
 
+    @property
+    def parameter(self) -> Parameter:
+        """It as a free parameter, which it can be if it is `ranged`."""
+        return Parameter(self.name, self.unit, self.low, self.high, self.value)  # type: ignore[arg-type]
+
 
 @dataclass(frozen=True, eq=False)
 class OpenedTwin:
@@ -181,7 +186,7 @@ def _chosen(known: Sequence[Known], free: Sequence[str], name: str) -> list[Para
             else f"{name} names no parameters: give a function keyword arguments with numbers as "
             "defaults, or declare [parameters] in a case.toml",
         )
-        return [Parameter(e.name, e.unit, e.low, e.high, e.value) for e in ranged]  # type: ignore[arg-type]
+        return [each.parameter for each in ranged]
     made = [_parameter(text, by_name, known) for text in free]
     names = [each.name for each in made]
     twice = sorted({each for each in names if names.count(each) > 1})
@@ -207,7 +212,7 @@ def _parameter(text: str, by_name: dict[str, Known], known: Sequence[Known]) -> 
             got=repr(text),
             remedy=f"write --free {name or 'NAME'}=LOW:HIGH; {_listed(known)}",
         )
-        return Parameter(name, found.unit, found.low, found.high, found.value)  # type: ignore[arg-type]
+        return found.parameter
     try:
         low, high, *start = map(float, given.split(":"))
         if len(start) > 1 or not name:
