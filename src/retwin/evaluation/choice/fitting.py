@@ -19,7 +19,7 @@ from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.choice.candidates import Candidates, Model
 from retwin.evaluation.choice.comparison import Comparison
 from retwin.evaluation.choice.fitted import CandidateScore, Fitted
-from retwin.evaluation.choice.folds import block_length, block_means, folds_of
+from retwin.evaluation.choice.folds import Fold, block_length, block_means, folds_of
 from retwin.evaluation.choice.remarks import remarks_of, without_twin
 from retwin.evaluation.choice.settings import MEMBERS, Choice
 from retwin.evaluation.choice.trials import Trials, shorter, unstable
@@ -105,22 +105,7 @@ def fit(
     if given is not None and not settings.compared:
         return _fit_alone(whole, given, time.process_time() - since, began)
     folds = folds_of(records)
-    part = len(folds) / (len(folds) + 1)  # the rest is the fit to all records
-    trials = Trials(
-        records,
-        folds,
-        names,
-        lambda own: replace(whole, records=own, settings=settings.lighter).fits,
-        progress and (lambda share: progress(part * share)),
-    )
-    trials.run()
-    require(
-        len(trials.reasons) < len(names),
-        "records",
-        expected="records to which a candidate can be fitted without a part of them",
-        got="; ".join(f"{name}: {reason}" for name, reason in trials.reasons.items()),
-        remedy="give longer or more records",
-    )
+    trials = _run_trials(whole, folds, names, progress)
     comparison, reasons = trials.compare(settings.horizon)
     horizon = settings.horizon
     if horizon is None and unstable(comparison, whole):
@@ -160,6 +145,29 @@ def fit(
         seconds=time.perf_counter() - began,
     )
     return with_yardstick(found, seed=seed) if settings.yardstick else found
+
+
+def _run_trials(
+    whole: Candidates, folds: list[Fold], names: list[str], progress: Progress | None
+) -> Trials:
+    """The fits of candidates without each fold, of which one at least succeeds."""
+    part = len(folds) / (len(folds) + 1)  # the rest is the fit to all records
+    trials = Trials(
+        whole.records,
+        folds,
+        names,
+        lambda own: replace(whole, records=own, settings=whole.settings.lighter).fits,
+        progress and (lambda share: progress(part * share)),
+    )
+    trials.run()
+    require(
+        len(trials.reasons) < len(names),
+        "records",
+        expected="records to which a candidate can be fitted without a part of them",
+        got="; ".join(f"{name}: {reason}" for name, reason in trials.reasons.items()),
+        remedy="give longer or more records",
+    )
+    return trials
 
 
 def _fit_alone(whole: Candidates, model: Model, taken: float, began: float) -> Fitted:
