@@ -125,6 +125,9 @@ def predict(
     file: Measured,
     case: CaseOption = None,
     out: Probabilities = None,
+    max_faults: Annotated[
+        int, option("N", "2 also tries pairs of stuck actuators.", "--max-faults")
+    ] = 1,
     mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
@@ -139,7 +142,12 @@ def predict(
     diagnoser = rt.load_diagnoser(saved(model))
     trajectories = read(file, data_case(case), max_bytes=max_bytes, mapping=mapping)
     with bar("diagnose") as show:
-        concluded = conclude(diagnoser, trajectories, progress=lambda share: show("faults", share))
+        concluded = conclude(
+            diagnoser,
+            trajectories,
+            max_faults=max_faults,
+            progress=lambda share: show("faults", share),
+        )
     probabilities, severities = concluded.probabilities, _severities(concluded)
     check_probabilities(trajectories, probabilities)
     labels = trajectories.labels.tolist()
@@ -179,12 +187,14 @@ def predict(
 
 def _severities(concluded: Conclusion) -> list[dict[str, float | None]]:
     """What an inversion gives besides for the most probable class of each trajectory."""
-    from retwin.diagnosis import StateDiagnosis
+    from retwin.diagnosis import Diagnosis, StateDiagnosis
 
     found, count = concluded.found, len(concluded.labels)
     if found is None:
         return [{} for _ in range(count)]
     columns = {"unknown": found.unknown}
+    if isinstance(found, Diagnosis) and found.several.any():
+        columns["several"] = found.several
     if isinstance(found, StateDiagnosis):
         own = (np.arange(count), found.probabilities.argmax(axis=1))
         columns |= {"size": found.size.value[own], "onset in s": found.onset.value[own]}

@@ -114,9 +114,7 @@ class ForecastErrors:
         leads = np.array([np.inf if each is None else each for each in values["leads"]], float)
         names = ("persistence", "deviation", "independent")
         arrays = [np.array(values[name], dtype=float) for name in names]
-        memory, low, high = (
-            np.array(values[name], dtype=float) for name in ("memory", "low", "high")
-        )
+        low, high = (np.array(values[name], dtype=float) for name in ("low", "high"))
         require(
             all(each.ndim == 2 and len(each) == len(leads) for each in arrays)
             and all(np.isfinite(each).all() and (each >= 0).all() for each in arrays)
@@ -128,7 +126,8 @@ class ForecastErrors:
             remedy="save the model again",
         )
         memory, beyond = float(values["memory"]), float(values["beyond"])
-        return cls(leads, *arrays, memory, low, high, beyond)
+        persistence, deviation, independent = arrays
+        return cls(leads, persistence, deviation, independent, memory, low, high, beyond)
 
 
 def value_range(values: NDArray) -> tuple[NDArray, NDArray]:
