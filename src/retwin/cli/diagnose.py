@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin import catalog
-from retwin.checks import require
 from retwin.cli.commands import Commands
 from retwin.cli.options import (
     CaseOption,
@@ -136,7 +135,7 @@ def predict(
     """Diagnose trajectories, and score the diagnoses if the labels are known."""
     import retwin as rt
     from retwin.diagnosis import conclude
-    from retwin.evaluation.diagnosers import scored
+    from retwin.evaluation.diagnosers import check_probabilities, scored
 
     if out is not None:
         check_place(out)
@@ -150,7 +149,7 @@ def predict(
             progress=lambda share: show("faults", share),
         )
     probabilities, severities = concluded.probabilities, _severities(concluded)
-    _check_finite(trajectories, probabilities)
+    check_probabilities(trajectories, probabilities)
     labels = trajectories.labels.tolist()
     labelled = bool(trajectories.known_labels) and "" not in labels
     classes = diagnoser.classes
@@ -243,20 +242,6 @@ def diagnoses(
             }
         )
     return made
-
-
-def _check_finite(trajectories: Trajectories, probabilities: NDArray) -> None:
-    """Raise InputError with the trajectories that have a probability that is not finite."""
-    bad = trajectories.ids[~np.isfinite(probabilities).all(axis=1)].tolist()
-    more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-    require(
-        not bad,
-        "probabilities",
-        expected="finite probabilities from the diagnoser",
-        got=f"NaN for {', '.join(bad[:5])}{more}",
-        remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser anew "
-        "if it gives NaN for others too",
-    )
 
 
 def write_probabilities(
