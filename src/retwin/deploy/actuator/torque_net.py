@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from retwin.checks import finite, require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.deploy.actuator.export import PARITY, PARTS, Standard, write_script
+from retwin.deploy.actuator.export import PARITY, ScriptedNetwork, write_script
 from retwin.errors import InputError
 from retwin.nets.networks import MLP
 from retwin.nets.training import Training
@@ -223,9 +223,7 @@ def _examples(
 
 def _write(network: Surrogate, path: Path, inputs: Tensor) -> None:
     """The network with its scales inside, read again and compared."""
-    before, inner, after = (getattr(network, each) for each in PARTS)
-    module = nn.Sequential(Standard(before, False), inner, Standard(after, True))
-    module = module.requires_grad_(False).eval()
+    module = ScriptedNetwork(network).eval()
     with write_atomically(path) as temporary:
         again: Any = write_script(module, Path(temporary))
         expected, found = module(inputs[:1000]), again(inputs[:1000])

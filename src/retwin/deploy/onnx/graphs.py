@@ -175,20 +175,13 @@ class SensorGraph(nn.Module):
 
     """
 
-    error_quantiles: Tensor
-    glitch_size: Tensor
-    resolution: Tensor
-
     def __init__(self, sensor: SampledSensor, width: int, rate: float) -> None:
         super().__init__()
         self.every, _ = sensor.timing(rate)
         self.glitch_probability = sensor.glitch_probability or 0.0
-        for name, values in (
-            ("error_quantiles", sensor.noise or ((0.0, 0.0),) * width),
-            ("glitch_size", sensor.glitch_size or (0.0,) * width),
-            ("resolution", sensor.steps or (0.0,) * width),
-        ):
-            self.register_buffer(name, torch.tensor(values, dtype=torch.float32))
+        self.error_quantiles = nn.Buffer(torch.tensor(sensor.noise or ((0.0, 0.0),) * width))
+        self.glitch_size = nn.Buffer(torch.tensor(sensor.glitch_size or (0.0,) * width))
+        self.resolution = nn.Buffer(torch.tensor(sensor.steps or (0.0,) * width))
 
     def forward(
         self,

@@ -79,7 +79,7 @@ class ResidualModel(Residual):
             else BernoulliHead(width, block.width)
             for block in correction.heads(inputs, outputs)
         )
-        self.register_buffer("spread", torch.ones(len(self.latent)))
+        self.spread = nn.Buffer(torch.ones(len(self.latent)))
 
     def forward(self, context: Context) -> Blocks:
         """The distribution q_ψ(z | u, ŷ), in physical units."""

@@ -64,10 +64,6 @@ class Residual(nn.Module, ABC):
 
     kind: ClassVar[str]
     """Kind of the saved model."""
-    bounds: Tensor
-    shift: Tensor
-    scale: Tensor
-    persistence: Tensor
     spread: Tensor
 
     def __init__(
@@ -91,9 +87,10 @@ class Residual(nn.Module, ABC):
         self.emulated = False
         self.timing: NDArray = np.empty((0, 0))
         self.fitted: Fit | None = None
-        for name in ("bounds", "shift", "scale"):
-            self.register_buffer(name, torch.ones(len(self.latent)))
-        self.register_buffer("persistence", torch.zeros(len(self.latent)))
+        self.bounds = nn.Buffer(torch.ones(len(self.latent)))
+        self.shift = nn.Buffer(torch.ones(len(self.latent)))
+        self.scale = nn.Buffer(torch.ones(len(self.latent)))
+        self.persistence = nn.Buffer(torch.zeros(len(self.latent)))
 
     def context(
         self,

@@ -166,7 +166,6 @@ class SequenceResidual(Residual):
     """
 
     kind = "sequence residual"
-    trust: Tensor
 
     def __init__(
         self,
@@ -190,8 +189,8 @@ class SequenceResidual(Residual):
         )
         self.before = Standardise(len(inputs) + len(outputs))
         self.members = self.fresh()
-        self.register_buffer("trust", torch.ones(len(self.latent)))
-        self.register_buffer("spread", torch.ones(()))
+        self.trust = nn.Buffer(torch.ones(len(self.latent)))
+        self.spread = nn.Buffer(torch.ones(()))
 
     def fresh(self) -> nn.ModuleList:
         """Members with random initial weights."""

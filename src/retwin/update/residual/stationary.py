@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
@@ -66,7 +66,7 @@ class StationaryResidual(Residual):
         super().__init__(
             correction, density, inputs=inputs, outputs=outputs, segmentation=segmentation
         )
-        self.register_buffer("spread", torch.ones(len(self.latent)))
+        self.spread = nn.Buffer(torch.ones(len(self.latent)))
 
     def forward(self, context: Context) -> Blocks:
         """The same Gaussian distribution at every sample."""
