@@ -33,7 +33,7 @@ from retwin.evaluation.fidelity import (
 )
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
-from retwin.serialisation.models import write_model
+from retwin.serialisation.models import save_model
 from retwin.study.estimates import write_estimates
 from retwin.study.files import Files, Job, Roles
 from retwin.study.plan import StudyPlan
@@ -403,8 +403,7 @@ class Work:
 
 def _least_squares(trial: Trial, path: Path) -> Updated:
     found = identify(trial.parametric, trial.healthy, **trial.updating)
-    with write_model(path, "parameters", {"values": found.values}, {}):
-        pass
+    save_model(path, "parameters", {"values": found.values}, {})
     return found
 
 

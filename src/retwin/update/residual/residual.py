@@ -21,7 +21,7 @@ from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import Blocks
 from retwin.nets.training import Fit
 from retwin.serialisation.configs import from_config, to_config
-from retwin.serialisation.models import read_model, write_model
+from retwin.serialisation.models import read_model, save_model
 from retwin.update.corrections import Context, Correction
 from retwin.update.surrogate import Surrogate
 
@@ -144,8 +144,7 @@ class Residual(nn.Module, ABC):
             "timing": [[None if np.isnan(t) else t for t in row] for row in self.timing],
             "fitted": None if self.fitted is None else asdict(self.fitted),
         }
-        with write_model(folder, self.kind, about, self.state_dict()):
-            pass
+        save_model(folder, self.kind, about, self.state_dict())
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
