@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import torch
@@ -25,8 +25,10 @@ from retwin.serialisation.models import read_model, save_model
 from retwin.update.corrections import Context, Correction
 from retwin.update.surrogate import Surrogate
 
+D = TypeVar("D")
 
-class Residual(nn.Module, ABC):
+
+class Residual(nn.Module, ABC, Generic[D]):
     """The distribution of z given a `Context`: call it to get a torch distribution.
 
     Parameters
@@ -69,7 +71,7 @@ class Residual(nn.Module, ABC):
     def __init__(
         self,
         correction: Correction,
-        density: Any,
+        density: D,
         *,
         inputs: Channels,
         outputs: Channels,
@@ -81,6 +83,7 @@ class Residual(nn.Module, ABC):
         self.inputs = inputs
         self.outputs = outputs
         self.segmentation = segmentation
+        self._check_correction()
         self.latent = correction.latent(inputs, outputs)
         self.sizes = [head.width for head in correction.heads(inputs, outputs)]
         self.degrees = [math.inf] * len(self.sizes)
@@ -91,6 +94,15 @@ class Residual(nn.Module, ABC):
         self.shift = nn.Buffer(torch.ones(len(self.latent)))
         self.scale = nn.Buffer(torch.ones(len(self.latent)))
         self.persistence = nn.Buffer(torch.zeros(len(self.latent)))
+        self._build()
+
+    @abstractmethod
+    def _check_correction(self) -> None:
+        """Raise InputError for an operator whose z this model cannot have."""
+
+    @abstractmethod
+    def _build(self) -> None:
+        """Make the networks, with random initial weights, and further buffers."""
 
     def context(
         self,
