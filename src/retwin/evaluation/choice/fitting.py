@@ -32,7 +32,13 @@ from retwin.update.corrections import Additive
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.forecast_errors import ForecastErrors
-from retwin.update.forecasts import LEADS, calibrate_forecasts, forecasts, free_moments
+from retwin.update.forecasts import (
+    LEADS,
+    LeftOut,
+    calibrate_forecasts,
+    forecasts,
+    free_moments,
+)
 from retwin.update.residual.fitting import calibrating
 from retwin.workers.threads import one_thread
 
@@ -201,11 +207,11 @@ def _calibrate(model: Model, trials: Trials, name: str, comparison: Comparison) 
         return model
     leads = [each for each in LEADS if 4 * each <= records.steps]
     for one, fold in zip(trials.models[name], trials.folds, strict=True):
-        if not fold.edge:
-            own = records[fold.rows]
-            free = free_moments(one, own.commands)[0]
-            found.append((forecasts(one, own, leads), free, own, fold.held[fold.rows]))
-    forecast = calibrate_forecasts(found, leads)
+        own = records[fold.rows]
+        free = free_moments(one, own.commands)[0]
+        part = (forecasts(one, own, leads), free, own, fold.held[fold.rows])
+        found.append(LeftOut(*part, fold.excess(records), fold.edge))
+    forecast = calibrate_forecasts(records, found, leads)
     if comparison.constant[name].any():
         assert isinstance(model, DynamicsTwin)
         constant = np.where(comparison.constant[name], forecast.deviation[-1], 0.0)
