@@ -160,6 +160,9 @@ class Results(ResultsPart):
         Whether the real trajectories are those of an emulated system.
     data : Data
         The data sets and their roles.
+    records : dict of str to Any
+        What was found in the real records, see `retwin.data.Checked`; empty in files of versions
+        that did not look.
     sources : dict of str to SourceResults
         By the source's key in `retwin.catalog.SOURCES`.
     published : dict of str to dict of str to str
@@ -190,6 +193,7 @@ class Results(ResultsPart):
     outputs: ChannelNames = ChannelNames()
     emulated: bool = False
     data: Data = Data()
+    records: dict[str, Any] = Field(default={})
     sources: dict[str, SourceResults] = Field(min_length=1)
     published: dict[str, dict[str, str]] = Field(default={})
     comparisons: list[Comparison] = Field(default=[])

@@ -237,7 +237,7 @@ def test_values_that_no_healthy_machine_gives_are_named(twin: DynamicsTwin) -> N
     with pytest.raises(InputError, match=r"got 1e\+300 of pressure"):
         fit_monitor(twin, replace(healthy, observed=huge))
     frozen[..., 1] = 1.0
-    with pytest.warns(UserWarning, match="healthy: pressure never changes"):
+    with pytest.warns(UserWarning, match="healthy: pressure, never changes"):
         fit_monitor(twin, replace(healthy, observed=frozen))
 
 

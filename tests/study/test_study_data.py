@@ -22,7 +22,12 @@ def test_real_sets_may_be_logs_with_a_mapping(tmp_path: Path) -> None:
     )
     (tmp_path / "m.toml").write_text(text)
     rows = [
-        ",".join([f"{k / case.rate}", *(f"{1 + (k + i) % 5}" for i in range(len(names)))])
+        ",".join(
+            [
+                f"{k / case.rate}",
+                *(f"{1 + (k + i) % 5 + k // 20 * (k % 2)}" for i in range(len(names))),
+            ]
+        )
         for k in range(90)
     ]
     (tmp_path / "log.csv").write_text("\n".join([",".join(("time", *names)), *rows]))

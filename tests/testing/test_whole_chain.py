@@ -449,7 +449,7 @@ def drawn_discrepancy(
     ],
 )
 @pytest.mark.filterwarnings("ignore:correction. bands of 90 %")
-@pytest.mark.filterwarnings("ignore:calibration. y2 never changes")
+@pytest.mark.filterwarnings("ignore:calibration. y2, never changes")
 def test_the_units_of_outputs_do_not_matter(name: str, correction: rt.Correction) -> None:
     """The same discrepancy is found in other units."""
     scale, offset = ODD[name]

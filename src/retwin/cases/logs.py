@@ -33,7 +33,7 @@ from retwin.twins.twin import Twin
 
 ROUNDED = 1e-3
 """Relative accuracy to which a rate is rounded that is computed from times."""
-CHANGED = ("no number", " to ", "put in order", "with the time of another")
+CHANGED = ("no number", " is read as ", " to ", "put in order", "with the time of another")
 """Words of notes about a channel whose values or times are not those of the log."""
 
 

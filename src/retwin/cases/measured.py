@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from retwin.checks import require
-from retwin.data.measured import stand_ins
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 
@@ -42,8 +41,6 @@ def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -
     constant = ", ".join(_constant(joined))
     if constant:
         notes[f"{constant}: constant in all logs, so that they show no dynamics of it."] = []
-    for each in stand_ins(joined):
-        notes[f"{each}."] = []
     return joined
 
 

@@ -26,10 +26,11 @@ from retwin.cli.options import (
     channel_names,
     option,
 )
-from retwin.cli.reading import data_case, read
+from retwin.cli.reading import data_case, read, shown_records
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
 from retwin.data.io import DataCase, check_target, save
+from retwin.data.quality.check import check_records
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.serialisation.files import sha256, write_atomically
 from retwin.serialisation.places import check_place
@@ -69,11 +70,12 @@ def info(
 ) -> None:
     """Describe files: classes, samples, channels, missing values, SHA-256."""
     system = _channels_of(case, inputs, outputs, mapping)
-    facts = [
-        _facts(read(file, system, rate, max_bytes=max_bytes, mapping=mapping), file)
-        for file in files
-    ]
-    shown = [table for each in facts for table in (_table(each), *_samplings(each))]
+    facts, shown = [], []
+    for file in files:
+        found = read(file, system, rate, max_bytes=max_bytes, mapping=mapping)
+        checked = check_records(found)
+        facts.append(_facts(found, file) | {"records": checked.values})
+        shown += [_table(facts[-1]), *_samplings(facts[-1]), *shown_records(checked)]
     answer(facts, *shown, as_json=as_json)
 
 

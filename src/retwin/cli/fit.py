@@ -15,7 +15,7 @@ from retwin.checks import given, require
 from retwin.checks import one_of as in_catalog
 from retwin.cli.completion import one_of
 from retwin.cli.options import CaseArgument, Horizon, Json, LogMapping, MaxBytes, Seed, seconds_of
-from retwin.cli.reading import read
+from retwin.cli.reading import read, shown_records
 from retwin.cli.terminal import Interrupted, answer, bar, note, table
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.places import check_place
@@ -309,5 +309,6 @@ def _print(found: Fitted, base: StandIn, out: Path, *, as_json: bool) -> None:
         shown += [text, table(("output", "RMSE", "NRMSE"), own, numbers=("RMSE", "NRMSE")), ""]
     failed = [f"{e.title}: {e.reason}" for e in found.scores if e.reason and found.parts]
     values = {"saved": str(out), **found.values, "surrogate": figures}
+    shown += shown_records(found.checked)
     answer(values, *shown, *found.remarks, *model_sentences(found), *failed, as_json=as_json)
     note(f"Saved {out}, with the report {out / 'report.html'}")

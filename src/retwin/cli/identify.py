@@ -23,6 +23,7 @@ from retwin.cli.options import (
     option,
     seconds_of,
 )
+from retwin.cli.reading import shown_records
 from retwin.cli.terminal import answer, bar, command_given, note, table
 from retwin.serialisation.places import check_place
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from retwin.cases.logs import Columns, LogReader, Logs
     from retwin.cases.opened_twin import OpenedTwin
+    from retwin.data.quality.check import Checked
     from retwin.data.trajectories import Trajectories
     from retwin.evaluation.identification import Identification
 
@@ -118,6 +120,7 @@ def identify(
     from retwin.deploy.identified import HOLDS, save_identification
     from retwin.evaluation import identification as room
     from retwin.twins import keep_workers
+    from retwin.update.agreement import check_with_twin
     from retwin.update.identification import identify as run
 
     check_place(out, folder=True, holds=HOLDS)
@@ -154,9 +157,12 @@ def identify(
             progress=lambda share: show("search, 2 of 3", share),
         )
         show("validate, 3 of 3", 0.0)
-        checked = room.validate_identification(found, opened.twin, used, held_out, seed=seed)
-        values = save_identification(checked, opened, read, out, command=command_given())
-    _print(checked, values, as_json=as_json)
+        judged = room.validate_identification(found, opened.twin, used, held_out, seed=seed)
+        checked = check_with_twin(opened.twin, read.trajectories)
+        values = save_identification(
+            judged, opened, read, out, checked=checked, command=command_given()
+        )
+    _print(judged, values, checked, as_json=as_json)
 
 
 def _separated(
@@ -255,7 +261,9 @@ def _plan(opened: OpenedTwin, used: Any, method: str) -> str:
     return f"{what} at {used.rate:g} Hz; {method} for {', '.join(opened.twin.names)}"
 
 
-def _print(found: Identification, values: dict[str, Any], *, as_json: bool) -> None:
+def _print(
+    found: Identification, values: dict[str, Any], checked: Checked, *, as_json: bool
+) -> None:
     """Parameters, errors before and after, and where the files are."""
     from retwin.report.identification.texts import findings, interval, state, value
 
@@ -282,6 +290,7 @@ def _print(found: Identification, values: dict[str, Any], *, as_json: bool) -> N
         "",
         *findings(found),
         *values["notes"],
+        *shown_records(checked),
         as_json=as_json,
     )
     if values["updated_case"]:

@@ -21,8 +21,9 @@ from retwin import catalog
 from retwin.checks import finite, positive, require
 from retwin.cli.commands import Commands
 from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase, argument, option
-from retwin.cli.reading import case_named, read, saved
+from retwin.cli.reading import case_named, read, saved, shown_records
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
+from retwin.data.quality.check import check_records
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
@@ -80,13 +81,16 @@ def fit(
     with bar("calibrate") as show:
         show("monitor", 0.0)
         given = Trajectories.concatenate(records)
+        checked = check_records(given)
         made = fit_monitor(
             twin, given, false_alarms, blanking=60.0 if blanking is None else blanking
         )
     made.save(out)
     promises = {name: str(each) for name, each in made.promises.items()}
     answer(
-        {"saved": str(out), "arl": made.arl, "warm_up": made.warm_up, "promises": promises},
+        {"saved": str(out), "arl": made.arl, "warm_up": made.warm_up, "promises": promises}
+        | {"records": checked.values},
+        *shown_records(checked),
         *(f"{name}: {text}" for name, text in promises.items()),
         as_json=as_json,
     )

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from retwin.checks import existing, given
-from retwin.cli.terminal import bar, note
+from retwin.cli.terminal import bar, note, table
 from retwin.data.io import DataCase, load
 from retwin.data.trajectories import Trajectories
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from retwin.cases.case import Case
+    from retwin.data.quality.check import Checked
     from retwin.update import CorrectedTwin, DynamicsTwin
 
 
@@ -103,3 +106,13 @@ def read_commands(file: Path, case: Case, *, mapping: Path | None = None) -> Tra
     unseen = np.zeros(nothing.shape, dtype=bool)
     outputs = {"outputs": twin.outputs, "nominal": nothing, "observed": nothing, "mask": unseen}
     return found.replace(**outputs)
+
+
+def shown_records(checked: Checked) -> list[RenderableType]:
+    """What records look like: how much their twin explains, and a table of what was found."""
+    from retwin.report.records import HEADS, TITLE, finding_rows
+
+    shown: list[RenderableType] = list(checked.sentences)
+    if checked.findings:
+        shown += ["", f"{TITLE}:", table(HEADS, finding_rows(checked.findings)), ""]
+    return shown

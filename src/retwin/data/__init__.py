@@ -16,6 +16,9 @@ _HOME = homes(
         "logs.mapping": "Mapping read_mapping",
         "logs.proposal": "propose_mapping",
         "provenance": "Provenance Sampling",
+        "quality.agreement": "explained_shares",
+        "quality.check": "Checked check_records",
+        "quality.finding": "Finding summarise",
         "segments": "Segments",
         "trajectories": "Channels HEALTHY Trajectories UNLABELLED",
     }

@@ -121,32 +121,6 @@ def stand_in(values: NDArray) -> tuple[float, int] | None:
     return None
 
 
-def doubtful(trajectories: Trajectories) -> list[str]:
-    """Notes about outputs from whose measurements nothing, or something wrong, is learned.
-
-    They never changed, or hold a value that seems to stand for a missing measurement.
-    """
-    notes = []
-    for k, name in enumerate(trajectories.outputs.names):
-        values = trajectories.observed[..., k][trajectories.mask[..., k]]
-        if len(values) > 1 and values.min() == values.max():
-            notes.append(f"{name} never changes, so that it shows no dynamics: check its sensor")
-    return notes + stand_ins(trajectories)
-
-
-def stand_ins(trajectories: Trajectories) -> list[str]:
-    """Notes about outputs with a value that seems to stand for a missing measurement."""
-    notes = []
-    for k, name in enumerate(trajectories.outputs.names):
-        coded = stand_in(trajectories.observed[..., k][trajectories.mask[..., k]])
-        if coded:
-            notes.append(
-                f"{name} is {coded[0]:g} at {coded[1]} samples, far from all others: replace it "
-                "by NaN if it stands for a missing measurement"
-            )
-    return notes
-
-
 def measured_only(trajectories: Trajectories) -> Trajectories:
     """The trajectories in which something was measured, as independent as they are many.
 

@@ -20,6 +20,11 @@ HOURS = ("%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%I:%M:%S %p", "%I:%M:%S.%f %p", "%
 """Formats of dates and of what follows them, of which one is taken that alone fits to all."""
 EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """The least times since 1970 in these units; smaller ones are in s."""
+DAY, DAYS = 86400.0, (20000.0, 80000.0)
+"""Seconds of a day, and serial days of the years 1954 to 2119 in spreadsheets."""
+SHORT, WHOLE = 1e-3, 1e-2
+"""Interval from which on such numbers are seconds, and how far one of days is from whole seconds,
+relative to it: times in s have other intervals."""
 SPELT = {"sec": "s", "seconds": "s", "µs": "us", "μs": "us"}
 """Other spellings of units."""
 
@@ -89,9 +94,27 @@ def row_times(values: NDArray, unit: str, clock: Clock, where: str) -> NDArray:
         values = np.array(found, dtype=object)
     stated = clock.unit or SPELT.get(unit, unit)
     if stated not in NANOSECONDS:
+        _check_days(values.astype(float), where)
         size = float(np.nanmax(np.abs(values.astype(float)), initial=0.0))
         stated = next((name for least, name in EPOCHS if size > least), "s")
     return to_nanoseconds(values, stated, where)
+
+
+def _check_days(values: NDArray, where: str) -> None:
+    """Refuse numbers without a unit that are serial days of a spreadsheet."""
+    step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+    seconds = step * DAY
+    days = len(values) > 1 and DAYS[0] < values.min() and values.max() < DAYS[1]
+    require(
+        not (days and 0 < step < SHORT and abs(seconds - round(seconds)) < WHOLE * seconds),
+        where,
+        expected="times in s, or another unit that is stated",
+        got=f"{values[0]:.10g}, … {step:.3g} apart, as days since 1900 of a spreadsheet "
+        f"{seconds:.3g} s apart"
+        if days
+        else "",
+        remedy="write dates as text (2026-01-31 12:00:00), or give the unit s if it is s",
+    )
 
 
 def times_that_are(

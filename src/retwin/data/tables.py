@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -33,6 +34,8 @@ TIMES = "times"
 """Why a column of times is no signal."""
 EVEN = "no times: rows at a given rate"
 """What is noted of a table without a column of times."""
+THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+"""A number with a comma that may stand before decimals or before thousands."""
 BLOCK = 65_536
 """Rows that are converted together."""
 TEXT_SHARE = 0.5
@@ -118,8 +121,17 @@ class Table:
                 yield (
                     Skipped(title, "text")
                     if text
-                    else Signal(title, times, values, unit, int(bad.sum()))
+                    else Signal(title, times, values, unit, int(bad.sum()), self._read(title))
                 )
+
+    def _read(self, name: str) -> str:
+        """How numbers such as 1,234 are read, of which all may be thousands; "" elsewhere."""
+        cells = self.cells(name)
+        text = self.comma and cells.dtype.kind == "U"
+        found = [cell.strip() for cell in cells.tolist() if "," in cell] if text else []
+        if not found or not all(map(THOUSANDS.fullmatch, found)):
+            return ""
+        return f"{found[0]} is read as {found[0].replace(',', '.')}, and not as thousands"
 
     def _likely_times(self) -> str:
         """The column of times by its name, else the first one of dates, else one that increases."""

@@ -18,6 +18,7 @@ from retwin.cases.logs import Logs
 from retwin.cases.opened_twin import OpenedTwin
 from retwin.cases.updated_case import updated_case
 from retwin.data.io import save
+from retwin.data.quality.check import Checked
 from retwin.errors import InputError
 from retwin.evaluation.identification import Identification
 from retwin.evaluation.identification.parameters import spread_of
@@ -26,6 +27,7 @@ from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.parametric import ParametricTwin
+from retwin.update.agreement import check_with_twin
 from retwin.update.identification.posterior import Posterior
 
 SCHEMA = 1
@@ -40,6 +42,7 @@ def save_identification(
     logs: Logs,
     folder: str | os.PathLike[str],
     *,
+    checked: Checked | None = None,
     command: str = "",
 ) -> dict[str, Any]:
     """Write the result of an identification, whole or not at all.
@@ -62,6 +65,8 @@ def save_identification(
         The measurements, as they were read.
     folder : path
         The folder to make, or to replace if it holds such files only.
+    checked : Checked, optional
+        What was found in the measurements; by default they are checked here.
     command : str
         The command that makes it again, for the page.
 
@@ -78,7 +83,8 @@ def save_identification(
 
     """
     check_place(folder, folder=True, holds=HOLDS)
-    values = identification_values(found, opened, logs)
+    checked = checked or check_with_twin(opened.twin, logs.trajectories)
+    values = identification_values(found, opened, logs) | {"records": checked.values}
     start = start_values(found.twin)
     with write_atomically(folder, folder=True) as part:
         save(logs.trajectories, part / "logs.npz")
@@ -97,7 +103,9 @@ def save_identification(
         if start:
             _write_json(part / "start_values.json", start)
         _write_json(part / "identification.json", values)
-        page = identification_page(found, values, start, command=command, folder=str(folder))
+        page = identification_page(
+            found, values, start, checked, command=command, folder=str(folder)
+        )
         (part / "report.html").write_text(page, encoding="utf-8", newline="\n")
         names = sorted(each.name for each in part.iterdir())
     return {**values, "files": {name: str(Path(folder) / name) for name in names}}

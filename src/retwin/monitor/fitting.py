@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import finite, instance, require
-from retwin.data.measured import check_magnitude, doubtful, unmeasured
+from retwin.data.measured import check_magnitude
+from retwin.data.quality.check import check_records
+from retwin.data.quality.finding import summarise
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.disturbance import fit_disturbance
 from retwin.monitor.monitor import Monitor
@@ -66,9 +68,8 @@ def fit_monitor(
     check_magnitude("healthy", healthy)
     arl = false_alarms(false_alarms_at_most, twin.rate)
     finite("blanking", blanking, least=0.0, unit="s")
-    notes = "; ".join(filter(None, [unmeasured(healthy), *doubtful(healthy)]))
-    if notes:
-        warnings.warn(f"healthy: {notes}", stacklevel=2)
+    for note in summarise(check_records(healthy).findings):
+        warnings.warn(f"healthy: {note}", stacklevel=2)
     measured = np.where(healthy.mask, healthy.observed, np.nan).astype(float)
     steps = resolution(np.moveaxis(measured, 2, 0).reshape(measured.shape[2], -1))
     first = _calibrated(twin, Predictor(), healthy, measured, steps)

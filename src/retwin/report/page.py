@@ -28,6 +28,7 @@ from retwin.serialisation.places import check_place
 FIGURES = (
     "summary",
     "scores",
+    "records",
     "confusion",
     "roc",
     "reliability",

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from retwin.cases.case import Case
 from retwin.checks import nothing, require
 from retwin.data.io import load
+from retwin.data.quality.copies import find_copies
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Report
@@ -119,7 +120,10 @@ def real_data(
             got=f"none, and the case {case.name!r} has no emulator",
             remedy="give --real FILE --folds K",
         )
-    return real, Roles.of(real.folds(plan.folds, seed=plan.seed_of("folds", 0)))
+    # Copies have no role: a fold would be tested by what the others were calibrated on.
+    first = _first(real)
+    folds = real[first].folds(plan.folds, seed=plan.seed_of("folds", 0))
+    return real, Roles.of((first[fit], first[test]) for fit, test in folds)
 
 
 def _records(case: Case, path: Path) -> tuple[Trajectories, Trajectories]:
@@ -136,11 +140,12 @@ def _records(case: Case, path: Path) -> tuple[Trajectories, Trajectories]:
 
 def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories, Roles]:
     """Both sets as one, with their roles; InputError if a trajectory is in both."""
-    known = dict(zip(_contents(calibration), calibration.ids.tolist(), strict=True))
+    both, count = Trajectories.concatenate([calibration, test]), len(calibration)
+    ids = [*calibration.ids.tolist(), *test.ids.tolist()]
     shared = [
-        f"{own}, which is {known[content]} of the calibration"
-        for content, own in zip(_contents(test), test.ids.tolist(), strict=True)
-        if content in known
+        f"{ids[i]}, which is {ids[j]} of the calibration"
+        for i, j, _ in find_copies(_measured(both))
+        if j < count <= i
     ]
     require(
         not shared,
@@ -149,18 +154,19 @@ def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories
         got="; ".join(shared[:3]) + (f"; {len(shared)} in all" if len(shared) > 3 else ""),
         remedy="leave them out of one of both sets",
     )
-    both = Trajectories.concatenate([calibration, test])
-    return both, Roles.of([(range(len(calibration)), range(len(calibration), len(both)))])
+    first = _first(both)
+    return both, Roles.of([(first[first < count], first[first >= count])])
 
 
-def _contents(trajectories: Trajectories) -> list[bytes]:
-    """What was commanded and measured in each trajectory, in bytes that are compared."""
-    measured = np.where(trajectories.mask, trajectories.observed, np.nan)
-    values = np.concatenate([trajectories.commands, measured], axis=2).astype(np.float32)
-    lengths = trajectories.lengths
-    return [
-        sha256(row[:length].tobytes()).digest() for row, length in zip(values, lengths, strict=True)
-    ]
+def _measured(trajectories: Trajectories) -> NDArray:
+    """Outputs (n, T, d_y), NaN where nothing was measured."""
+    return np.where(trajectories.mask, trajectories.observed, np.nan)
+
+
+def _first(trajectories: Trajectories) -> NDArray:
+    """Indices of the trajectories that are no copies of earlier ones."""
+    copies = [i for i, _, _ in find_copies(_measured(trajectories))]
+    return np.setdiff1d(np.arange(len(trajectories)), copies)
 
 
 def _labelled(trajectories: Trajectories, case: Case, name: str) -> Trajectories:

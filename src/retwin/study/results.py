@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.catalog import METRICS, SOURCES
+from retwin.data.quality.check import Checked
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.fidelity import Fidelity, Overlay
 from retwin.results import SCHEMA, Results
@@ -25,6 +26,7 @@ from retwin.source_results import CurvePoint, SourceResults
 from retwin.study.answers import Answers, answers
 from retwin.study.files import Job
 from retwin.study.work import Work
+from retwin.update.agreement import check_with_twin
 
 
 def write_results(
@@ -56,7 +58,8 @@ def write_results(
     scored = {name: _fidelity_of(work, name) for name in work.plan.sources}
     fidelity = {name: each for name, each in scored.items() if each is not None}
     sources = {name: _source(work, found, name, drawn[name]) for name in work.plan.sources}
-    arrays = found.arrays()
+    checked = check_with_twin(work.case.twin, real)
+    arrays = found.arrays() | _record_arrays(checked)
     for name, each in fidelity.items():
         arrays |= _fidelity_arrays(name, each)
     overlay = _overlay(work)
@@ -82,6 +85,7 @@ def write_results(
             "outputs": vars(work.case.outputs),
             "emulated": real.emulated,
             "data": _data(work, real, test, about),
+            "records": checked.values,
             "sources": sources,
             "published": {} if real.emulated else dict(work.case.published),
             "comparisons": _comparisons(work, found, sources, drawn),
@@ -98,6 +102,15 @@ def write_results(
     with write_atomically(out / "results.json") as part:
         part.write_text(results.to_json(), encoding="utf-8")
     return results
+
+
+def _record_arrays(checked: Checked) -> dict[str, NDArray]:
+    """The records that have findings, of which the page shows pictures."""
+    named = {each.record for each in checked.findings}
+    own = checked.records[np.isin(checked.records.ids, list(named))]
+    names = ("commands", "nominal", "observed", "mask", "ids")
+    arrays = {f"records/{name}": getattr(own, name) for name in names}
+    return arrays | {"records/rate": np.array(own.rate)}
 
 
 def _source(work: Work, found: Answers, name: str, drawn: Mapping[str, Draws]) -> SourceResults:

@@ -10,6 +10,7 @@ from retwin._lazy import homes, names
 
 _HOME = homes(
     {
+        "agreement": "check_with_twin",
         "blackbox": "BlackBox fit_black_box",
         "corrected": "CorrectedTwin generate",
         "corrections": "Additive Chain CommandSpace Context Correction DelayOffset Discrepancy "

@@ -24,6 +24,8 @@ DISORDER = 10.0
 processes overtake each other. A longer one is a clock that was set."""
 HOUR = 3600.0
 """By how much clocks are set back at the end of summer time, in s."""
+EVEN = 0.1
+"""Share of intervals that differ, and relative difference from the median, of even rows."""
 DECIMATED = 1.5
 """Ratio of the rates from which linear resampling leaves out values."""
 
@@ -146,6 +148,7 @@ def _channel(
         notes.append(
             "1 value is no number" if one else f"{signal.unreadable} values are no numbers"
         )
+    notes += [signal.note] * bool(signal.note)
     coded = stand_in(signal.values)
     if coded:
         notes.append(
@@ -272,8 +275,10 @@ def in_order(signal: Signal, where: str) -> tuple[Signal, list[str]]:
         "place for even rows",
     )
     worst = int(np.argmin(steps))
+    even = np.mean(np.abs(np.delete(steps, worst) - typical) <= EVEN * typical) > 1 - EVEN
+    repeated = abs(HOUR + steps[worst] - typical) <= EVEN * typical and even
     require(
-        abs(HOUR + steps[worst]) > 1.5 * typical or steps[worst] >= -typical,
+        (abs(HOUR + steps[worst]) > 1.5 * typical or steps[worst] >= -typical) and not repeated,
         place,
         expected="times of a clock that nobody sets",
         got=f"one hour twice, at {times[worst]:g} s, as at the end of summer time",

@@ -79,6 +79,8 @@ class Signal:
         Its unit as the log has it, "" if it has none.
     unreadable : int
         Values that are no numbers, and count as missing.
+    note : str
+        How its numbers were read where they may mean something else, "" elsewhere.
 
     """
 
@@ -87,6 +89,7 @@ class Signal:
     values: NDArray
     unit: str = ""
     unreadable: int = 0
+    note: str = ""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.data.quality.check import Checked
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.files import write_atomically, write_json
 from retwin.update.corrected import CorrectedTwin
@@ -89,6 +90,8 @@ class Fitted:
         What corrected state equations learned; None where the twin has none.
     seconds : float
         Duration.
+    checked : Checked
+        The records that were given, and what was found in them before anything was learned.
 
     """
 
@@ -105,6 +108,7 @@ class Fitted:
     deviation: NDArray
     learned: FittedDynamics | None
     seconds: float
+    checked: Checked
 
     def score(self, name: str) -> CandidateScore:
         """The score of a candidate."""
@@ -125,6 +129,7 @@ class Fitted:
             "remarks": list(self.remarks),
             "parameters": {name: list(each) for name, each in self.parameters.items()},
             "seconds": self.seconds,
+            "records": self.checked.values,
             "dynamics": self._learned,
             "residual": self._residual,
             "one_step_errors": self.one_step_errors,

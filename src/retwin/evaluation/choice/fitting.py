@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from retwin.catalog import CANDIDATES
 from retwin.checks import require
 from retwin.data.measured import check_magnitude
+from retwin.data.quality.check import Checked
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.choice.candidates import Candidates, Model
 from retwin.evaluation.choice.comparison import Comparison
@@ -27,6 +28,7 @@ from retwin.progress import Progress
 from retwin.scores.distributions import crps_normal
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Twin, check_channels
+from retwin.update.agreement import check_with_twin
 from retwin.update.blackbox import BLACK_BOXES, fit_black_box
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive
@@ -100,8 +102,10 @@ def fit(
         or no candidate that can be fitted.
 
     """
-    began, records = time.perf_counter(), _select_records(records, settings)
+    began, given_records = time.perf_counter(), records
+    records = _select_records(records, settings)
     check_channels(twin, records, "records")
+    checked = check_with_twin(original or twin, given_records)
     alone = None if settings.compared else progress
     whole = Candidates(twin, records, settings, seed, case, original, alone)
     names = _names(whole, settings)
@@ -109,7 +113,7 @@ def fit(
     # First, so that settings of a given method that are wrong are so before the comparison.
     given = whole.fits[settings.method]() if settings.method else None
     if given is not None and not settings.compared:
-        return _fit_alone(whole, given, time.process_time() - since, began)
+        return _fit_alone(whole, given, time.process_time() - since, began, checked)
     folds = folds_of(records)
     trials = _run_trials(whole, folds, names, progress)
     comparison, reasons = trials.compare(settings.horizon)
@@ -149,6 +153,7 @@ def fit(
         deviation=deviation,
         learned=whole.learned if "learned" in vars(whole) else None,
         seconds=time.perf_counter() - began,
+        checked=checked,
     )
     return with_yardstick(found, seed=seed) if settings.yardstick else found
 
@@ -176,7 +181,9 @@ def _run_trials(
     return trials
 
 
-def _fit_alone(whole: Candidates, model: Model, taken: float, began: float) -> Fitted:
+def _fit_alone(
+    whole: Candidates, model: Model, taken: float, began: float, checked: Checked
+) -> Fitted:
     """The given method, of which nothing but its own fit is known."""
     name, nothing = whole.settings.method, np.full(whole.records.observed.shape, np.nan)
     row = _row(name, None, {}, taken, "not compared")
@@ -198,6 +205,7 @@ def _fit_alone(whole: Candidates, model: Model, taken: float, began: float) -> F
         deviation=nothing,
         learned=whole.learned if "learned" in vars(whole) else None,
         seconds=time.perf_counter() - began,
+        checked=checked,
     )
 
 

@@ -12,6 +12,7 @@ from retwin.report.choice.texts import model_sentences
 from retwin.report.figure import Band, Figure, Key, Line, Mark, record_panel
 from retwin.report.identification.figures import OUTPUTS, SAMPLES
 from retwin.report.labels import significant
+from retwin.report.records import TITLE, records_part
 from retwin.update.forecast_errors import USUAL
 
 MEASURED, PREDICTED = "ink", "c0"
@@ -31,11 +32,14 @@ def fit_page(found: Fitted, folder: str, *, title: str) -> str:
 
     """
     figures = {"predictions": _predictions(found)} if found.parts else {}
+    part = records_part(found.checked)
     forecast = found.twin.forecast
     return render_page(
         environment(emulated=found.records.emulated),
         "fit",
-        figures.values(),
+        [*figures.values(), *([part.figure] if part.figure else [])],
+        part=part,
+        records_title=TITLE,
         found=found,
         title=title,
         folder=folder,

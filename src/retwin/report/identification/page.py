@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from math import isfinite
 from typing import Any
 
+from retwin.data.quality.check import Checked
 from retwin.evaluation.identification import Identification
 from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Cell, Table, grouped, tabulate, text_column
@@ -21,6 +22,7 @@ from retwin.report.identification.texts import (
     value,
 )
 from retwin.report.labels import behind, number, p_value, shown_unit, signed, significant
+from retwin.report.records import TITLE, records_part
 
 STRONG = 0.9
 """Correlation from which a cell is emphasised."""
@@ -34,6 +36,7 @@ def identification_page(
     found: Identification,
     values: Mapping[str, Any],
     start_values: Mapping[str, float],
+    checked: Checked,
     *,
     command: str,
     folder: str,
@@ -48,17 +51,21 @@ def identification_page(
         The contents of identification.json.
     start_values : mapping of str to float
         Start values of an FMU; empty for another twin.
+    checked : Checked
+        What was found in the records.
     command : str
         The command that makes it again; "" if there is none.
     folder : str
         The folder in which the page lies, as it was given.
 
     """
-    drawn = figures(found)
+    drawn, part = figures(found), records_part(checked)
     return render_page(
         environment(emulated=bool(values["emulated"])),
         "identification",
-        drawn.values(),
+        [*drawn.values(), *([part.figure] if part.figure else [])],
+        part=part,
+        records_title=TITLE,
         found=found,
         values=values,
         start_values=start_values,

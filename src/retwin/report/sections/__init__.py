@@ -15,6 +15,7 @@ __all__ = ["SECTIONS", "sections_of"]
 
 SECTIONS = (
     "scores",
+    "records",
     "paper",
     "comparisons",
     "confusion",

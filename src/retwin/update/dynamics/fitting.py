@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from retwin.checks import require
-from retwin.data.measured import doubtful, unmeasured
+from retwin.data.measured import unmeasured
+from retwin.data.quality.check import doubtful
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
@@ -162,7 +163,7 @@ def fit_dynamics(
     unknown = estimation.undetermined(found)[: unknowns.count]
     if alone.absorbed is not None:
         unknown |= (alone.absorbed(fitted.point.shared)[1] != 0).any(axis=0)
-    own = [_notes(estimation, found.point, unknown), unmeasured(observed), *doubtful(observed)]
+    own = [_notes(estimation, found.point, unknown), unmeasured(observed), doubtful(observed)]
     notes = "; ".join(filter(None, own))
     if notes:
         warnings.warn(notes, stacklevel=2)

@@ -32,9 +32,6 @@ BLOCKS = 8
 SHARED = 0.5
 """Share of the information on a direction that one block may have: beyond it, as with the start of
 a state, sums over blocks say nothing of the error."""
-COPY, COMPARED = 1e-5, 10
-"""Largest difference of the outputs of two trajectories, in standard deviations, up to which one is
-a copy of the other, and the samples of a trajectory below which that is not compared."""
 MAX_AUTOCORRELATION = 0.999
 """Largest lag-one autocorrelation, which bounds the correlation time at 1999 samples."""
 
@@ -270,29 +267,6 @@ def blocks_of(residual: NDArray) -> NDArray:
     place = np.cumsum(seen, axis=1) - seen
     own = place * number // np.maximum(seen.sum(axis=1, keepdims=True), 1)
     return np.asarray(np.minimum(own, number - 1) + number * np.arange(len(residual))[:, None])
-
-
-def distinct(measured: NDArray) -> NDArray:
-    """Indices of the trajectories whose outputs (n, P, d_y) are no copy of an earlier one's.
-
-    NaN is what was not measured. Replicates of one program differ by their noise, copies do not;
-    outputs that never change are no evidence of a copy.
-    """
-    seen = np.isfinite(measured)
-    count, spread = seen.sum(axis=(1, 2)), np.nanstd(measured, axis=(0, 1))
-    ends = np.where(seen, measured, np.inf).min(1), np.where(seen, measured, -np.inf).max(1)
-    moves = (ends[1] - ends[0] > COPY * spread).any(axis=1)
-    mean = np.nansum(measured, axis=(1, 2)) / np.maximum(count, 1)
-    order = [i for i in np.argsort(mean, kind="stable") if count[i] >= COMPARED and moves[i]]
-    copies = set()
-    for place, i in enumerate(order):
-        for j in order[place - 1 :: -1] if place else ():
-            if mean[i] - mean[j] > COPY * spread.sum():
-                break
-            apart = np.nan_to_num(np.abs(measured[i] - measured[j])).max(axis=0)
-            if (seen[i] == seen[j]).all() and (apart <= COPY * spread).all():
-                copies.add(max(i, j))
-    return np.array([i for i in range(len(measured)) if i not in copies])
 
 
 def standard_errors(jacobian: NDArray, residual: NDArray) -> NDArray:

@@ -16,6 +16,7 @@ from scipy import stats
 
 from retwin.checks import require
 from retwin.data.measured import measured_only, unmeasured
+from retwin.data.quality.copies import find_copies
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
@@ -27,7 +28,6 @@ from retwin.update.identification.identifiability import (
     CHI2_95,
     MIN_TRAJECTORIES,
     Identifiability,
-    distinct,
     identifiability,
     noise_of,
     standard_errors,
@@ -303,14 +303,15 @@ def _fitted(
     optima = search.run(np.random.default_rng(misfit.seed))
     best, point = optima[0]
     residual = misfit.residuals(np.array([best.values]))[0]
-    once = distinct(np.where(misfit.seen, misfit.measured, np.nan))
+    copies = find_copies(np.where(misfit.seen, misfit.measured, np.nan))
+    once = np.setdiff1d(np.arange(len(residual)), [i for i, _, _ in copies])
     found, errors, agreeing = _identifiability(search, optima, point, residual, once)
     # Starts draw all parameters; one without effect has no other value than the present one.
     kept = np.where(found.effects > 0, best.values, twin.values)
     if (kept != best.values).any():
         best = replace(best, values=tuple(kept.tolist()))
         optima = [(best, point), *optima[1:]]
-    count, copies = len(once), len(residual) - len(once)
+    count = len(once)
     half = stats.t.ppf(0.975, max(count - 1, 1)) * errors
     values = np.array(best.values)
     if misfit.windows is not None:
@@ -338,7 +339,7 @@ def _fitted(
             "rms_after": misfit.rms_of(residual),
             "measurements": float(misfit.seen.sum()),
             "independent": found.independent,
-            "copies": float(copies),
+            "copies": float(len(copies)),
             "starts_agreeing": float(agreeing),
         },
         reason="; ".join(filter(None, [best.reason, found.warning, missing, unknown])),

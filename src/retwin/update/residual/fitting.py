@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.checks import agree, instance, require
-from retwin.data.measured import check_magnitude, doubtful, unmeasured
+from retwin.data.measured import check_magnitude, unmeasured
+from retwin.data.quality.check import doubtful
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
@@ -203,7 +204,7 @@ def fit_residual(
         calibration, calibrate_on, getattr(correction, "severities", False), 1 if stepwise else 3
     )
     used = calibration[keep]
-    missing = "; ".join(filter(None, [unmeasured(used), *doubtful(used)]))
+    missing = "; ".join(filter(None, [unmeasured(used), doubtful(used)]))
     if missing:
         warnings.warn(f"calibration: {missing}", stacklevel=2)
     given = segments if isinstance(segments, str) else segments[keep]

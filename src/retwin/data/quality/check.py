@@ -1,0 +1,110 @@
+"""`check_records`: what a user must know of records before anything is learned from them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from retwin.data.quality.agreement import GENERAL, explained_shares, find_disagreements
+from retwin.data.quality.copies import find_copies
+from retwin.data.quality.finding import Finding, summarise
+from retwin.data.quality.jumps import find_jumps
+from retwin.data.quality.readings import readings_of
+from retwin.data.quality.scales import find_scales
+from retwin.data.quality.sensors import find_constant, find_noise, find_stretches
+from retwin.data.trajectories import Trajectories
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """Records, and what a user must know of them.
+
+    Attributes
+    ----------
+    records : Trajectories
+        The records, with the nominal outputs that they were compared with.
+    findings : tuple of Finding
+        In the order of the records; none for clean records.
+    explained : dict of str to dict of str to float
+        Share of the variance of each output that its nominal output explains, for `healthy` and
+        `faulty` records; empty where nominal outputs are not known.
+
+    """
+
+    records: Trajectories
+    findings: tuple[Finding, ...] = ()
+    explained: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    @property
+    def sentences(self) -> list[str]:
+        """How much nominal outputs explain, in a sentence for each kind of record."""
+        made = []
+        for kind, shares in self.explained.items():
+            own = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in shares.items())
+            which = "" if len(self.explained) == 1 else f" in {kind} records"
+            made.append(f"The twin as it was given explains{which} {own} (share of the variance).")
+        return made
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The same as JSON values."""
+        return {"findings": [asdict(each) for each in self.findings], "explained": self.explained}
+
+
+def check_records(records: Trajectories) -> Checked:
+    """What is wrong with records, as far as their arrays show it.
+
+    Copies and near copies; outputs that freeze, stop at a limit, jump, drop to zero, or are noise;
+    units that are wrong by a power of ten; and, where nominal outputs are known, records that do
+    not belong to their commands, exchanged channels, a wrong time base, and labels that do not
+    suit the motion.
+
+    Parameters
+    ----------
+    records : Trajectories
+        Recorded outputs with commands; `nominal` counts as known where it changes.
+
+    Returns
+    -------
+    Checked
+        Its `findings` are none for clean records.
+
+    """
+    ids = records.ids.tolist()
+    found = [
+        Finding(name, "", "unmeasured", "nothing was measured: it is not used", severity="unusable")
+        for name, mask in zip(ids, records.mask, strict=True)
+        if not mask.any()
+    ]
+    scales = list(find_scales(records))
+    # What is in another unit would hide all else.
+    rest = records[~np.isin(records.ids, [each.record for each in scales])] if scales else records
+    for every in readings_of(rest):
+        constant = list(find_constant(every))
+        found += constant or find_jumps(every)
+        healthy = [each for each in every if each.healthy]  # a faulty machine may stand still
+        if healthy and not constant:
+            found += [*find_stretches(healthy), *find_noise(healthy)]
+    found += [
+        Finding(ids[i], "", "copy", f"a copy of {ids[j]}" + f", {why}" * bool(why))
+        for i, j, why in find_copies(np.where(records.mask, records.observed, np.nan))
+    ]
+    found += [*scales, *find_disagreements(rest)]
+    # A record of which more is known needs no more general finding.
+    other = {each.record for each in found if each.kind not in GENERAL}
+    found = [each for each in found if each.kind not in GENERAL or each.record not in other]
+    order = {name: place for place, name in enumerate(ids)}
+    found.sort(key=lambda each: order.get(each.record, -1))
+    known = len(records) > 0 and np.ptp(records.nominal) > 0
+    return Checked(records, tuple(found), explained_shares(rest) if known else {})
+
+
+def doubtful(records: Trajectories) -> str:
+    """Sentences about outputs that show nothing, or hold a value that seems to stand for none.
+
+    It is quick, for verbs that are called many times.
+    """
+    every = readings_of(records, samples=1)
+    return "; ".join(summarise(found for each in every for found in find_constant(each)))

@@ -1,0 +1,99 @@
+"""What records look like: a table of findings, and a small picture of each record that has some."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.quality.check import Checked
+from retwin.data.quality.finding import Finding
+from retwin.data.trajectories import Trajectories
+from retwin.report.blocks import Table, tabulate, text_column
+from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, Spans
+
+TITLE = "What your records look like"
+"""The heading on the terminal and on pages."""
+ROWS, PICTURES = 40, 12
+"""Findings and pictures that are shown, at most."""
+CLEAN = "Nothing was found that speaks against the records."
+"""What is said where there is no finding."""
+HEADS = ("record", "channel", "time", "finding")
+"""The columns of the table."""
+
+
+@dataclass(frozen=True)
+class RecordsPart:
+    """What the template `records.html.j2` shows: sentences, a table, and pictures."""
+
+    sentences: Sequence[str]
+    table: Table
+    figure: Figure | None
+
+
+def records_part(checked: Checked) -> RecordsPart:
+    """The part of a page about records."""
+    table = tabulate("Findings", [*map(text_column, HEADS)], finding_rows(checked.findings))
+    sentences = checked.sentences + [CLEAN] * (not checked.findings)
+    return RecordsPart(sentences, table, records_figure(checked))
+
+
+def finding_rows(findings: Sequence[Finding]) -> list[tuple[str, str, str, str]]:
+    """Record, channel, time and text of findings, and how many more there are."""
+    rows = [each.row for each in findings[:ROWS]]
+    more = len(findings) - ROWS
+    return [*rows, (f"and {more} more", "", "", "")] if more > 0 else rows
+
+
+def records_figure(checked: Checked) -> Figure | None:
+    """A picture of each channel with findings, measured and nominal; None without any."""
+    records = checked.records
+    ids = {name: place for place, name in enumerate(records.ids.tolist())}
+    places = list(
+        dict.fromkeys(
+            (ids[each.record], each.channel) for each in checked.findings if each.record in ids
+        )
+    )
+    if not places:
+        return None
+    panels = [_panel(checked, *place) for place in places[:PICTURES]]
+    keys = [Key("measured", "ink"), Key("where it is", "alarm", "bar")]
+    if "healthy" in checked.explained or "faulty" in checked.explained:
+        keys.insert(1, Key("twin as it was given", "c0"))
+    return Figure("records", panels, keys)
+
+
+def _panel(checked: Checked, row: int, channel: str) -> Panel:
+    """One output of one record over time; of a record as a whole, the one that moves most."""
+    records, record = checked.records, str(checked.records.ids[row])
+    length = int(records.lengths[row])
+    times = np.arange(length) / records.rate
+    marks: list[Mark] = [
+        Spans([(each.start, each.end)], "alarm", 0.15)
+        for each in checked.findings
+        if each.record == record and each.channel == channel and each.end > each.start
+    ]
+    if channel in records.inputs.names:
+        k, unit = records.inputs.names.index(channel), records.inputs.units
+        marks.append(Line(times, records.commands[row, :length, k], "measured", "ink"))
+        return _framed(times, record, channel, unit[k], marks)
+    k = records.outputs.names.index(channel) if channel else _moving(records, row)
+    values = np.where(records.mask[row, :length, k], records.observed[row, :length, k], np.nan)
+    marks.append(Line(times, values, "measured", "ink", width=1.4))
+    if checked.explained:
+        marks.insert(0, Line(times, records.nominal[row, :length, k], "twin", "c0", alpha=0.7))
+    return _framed(times, record, records.outputs.names[k], records.outputs.units[k], marks)
+
+
+def _moving(records: Trajectories, row: int) -> int:
+    spread = np.ptp(records.observed, axis=(0, 1))
+    own = np.ptp(records.observed[row], axis=0)
+    return int(np.argmax(np.divide(own, spread, out=np.zeros_like(own), where=spread > 0)))
+
+
+def _framed(times: NDArray, record: str, name: str, unit: str, marks: Sequence[Mark]) -> Panel:
+    x = Axis("time", "s", (float(times[0]), float(times[-1])), count=4)
+    title = f"{record}: {name}"
+    return Panel(x, [Row(Axis(name, unit), marks)], f"{title} over time", title, height=180)

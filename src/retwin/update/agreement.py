@@ -1,0 +1,84 @@
+"""`check_with_twin`: records and the twin that they are for, before anything is learned."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.quality.agreement import explained_shares
+from retwin.data.quality.check import Checked, check_records
+from retwin.data.quality.finding import Finding
+from retwin.data.trajectories import Trajectories
+from retwin.errors import InputError
+from retwin.twins.collected import SimulationError
+from retwin.twins.twin import Twin
+
+CLEAR = 0.5
+"""Ratio of residuals from which exchanged commands are named."""
+UNEXPLAINED = 0.1
+"""Share of the variance that a twin leaves, below which commands are in their places."""
+PAIRS = 15
+"""Pairs of commands that are tried, at most."""
+
+
+def check_with_twin(twin: Twin | None, records: Trajectories) -> Checked:
+    """Check records against a twin: `check_records` by its outputs, and exchanged commands.
+
+    Parameters
+    ----------
+    twin : Twin or None
+        With the channels of the records. Where it is None, or cannot simulate the commands, the
+        nominal outputs of the records are taken.
+    records : Trajectories
+        Recorded outputs with commands.
+
+    Returns
+    -------
+    Checked
+        Its `findings` are none for clean records.
+
+    """
+    ideal = None if twin is None else simulated(twin, records)
+    if twin is None or ideal is None:
+        return check_records(records)
+    found = check_records(records.replace(nominal=ideal))
+    return replace(found, findings=(*_exchanged(twin, found.records), *found.findings))
+
+
+def simulated(twin: Twin, records: Trajectories) -> NDArray | None:
+    """What a twin simulates for the commands (n, T, d_y); None if it cannot."""
+    try:
+        made = twin.simulate(records.commands, seed=0).observed
+    except (InputError, SimulationError):
+        return None
+    return made if np.isfinite(made).all() else None
+
+
+def _exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
+    """Pairs of commands with which the twin explains more where they are exchanged."""
+    healthy = records[records.maybe_healthy] if records.maybe_healthy.any() else records
+    here, names = _unexplained(healthy), records.inputs.names
+    if here < UNEXPLAINED:
+        return
+    for a, b in list(combinations(range(len(names)), 2))[:PAIRS]:
+        order = np.arange(len(names))
+        order[[a, b]] = order[[b, a]]
+        other = healthy.replace(commands=healthy.commands[..., order])
+        ideal = simulated(twin, other)
+        if ideal is None:
+            continue
+        there = _unexplained(other.replace(nominal=ideal))
+        if there < min(CLEAR * here, CLEAR):
+            text = f"seems to be exchanged with {names[b]}: its twin explains {1 - there:.0%} of "
+            text += f"the variance that way, {1 - here:.0%} as they are"
+            yield Finding("", names[a], "exchanged", text)
+
+
+def _unexplained(records: Trajectories) -> float:
+    """Share of the variance of outputs that nominal ones do not explain, over all outputs."""
+    shares = explained_shares(records)
+    return float(np.nanmean([1 - each for own in shares.values() for each in own.values()]))
