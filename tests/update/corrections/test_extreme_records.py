@@ -8,6 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 import retwin as rt
+from retwin.inference.losses import StudentT
+from retwin.inference.noise import Noise
+from retwin.update.corrections.command_problem import COMMON_ERROR, CommandProblem
 
 RATE = 50.0
 OPERATORS = (rt.DelayOffset, rt.CommandSpace)
@@ -197,3 +200,35 @@ def test_delays_that_noise_could_have_made_are_not_identified(
     # With 20 of 160 or more, 0.8 has a probability above 0.01 where 0.9 is true.
     if share[1]:
         assert torch.cat(covered).double().mean() >= 0.8
+
+
+@pytest.mark.parametrize("walks", [False, True])
+def test_the_mean_of_a_rest_errs_by_what_actuators_creep(walks: bool) -> None:
+    """A walk of n steps of variance q ends away from its mean by a variance of q n / 3."""
+    context, _, outputs = measured(Plane(), commands_of(100))
+    mask = torch.ones(outputs.shape).bool()
+    problem = CommandProblem.of(context, outputs, mask, delay_range=(0.0, 8.0), max_samples=400)
+    rest = problem.inside * (problem.group == 0)[:, None]
+    steps = torch.tensor(np.random.default_rng(5).normal(size=outputs.shape))
+    residual, counts = torch.zeros_like(outputs), rest.sum(dim=-1)
+    for i, m in counts.nonzero().tolist():
+        inside = rest[i, m] > 0
+        values = steps[i, inside].cumsum(dim=0) if walks else steps[i, inside]
+        residual[i, inside] = values - values.mean(dim=0)
+    scale = residual[rest.sum(dim=1) > 0].std(correction=0)
+    noise = Noise(scale.expand(2, 1), torch.ones(2).double(), StudentT(1e6))
+    count = counts[counts > 0].mean()
+    error = noise.scale[0, 0] ** 2 * problem.creep(noise, residual) / count
+    independent = scale**2 * (1 / count + COMMON_ERROR)
+    np.testing.assert_allclose(error, count / 3 if walks else independent, rtol=0.25)
+
+
+def test_replicates_of_a_motion_count_once() -> None:
+    """What a path between two levels errs is the same in all four of them; at rest it is not."""
+    thinning = []
+    for copies in (1, 4):
+        context, _, outputs = measured(Plane(), commands_of(5).repeat(copies, axis=0))
+        mask = torch.ones(outputs.shape).bool()
+        learned = rt.CommandSpace().infer_with_hyperparameters(context, outputs, mask)[1]
+        thinning.append(learned.noise.thinning.numpy())
+    np.testing.assert_allclose(thinning[1] / thinning[0], [1.0, 4.0], rtol=0.2)

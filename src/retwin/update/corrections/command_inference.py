@@ -17,13 +17,14 @@ from torch import Tensor
 
 from retwin.checks import require
 from retwin.inference.em import expectation_maximisation
-from retwin.inference.hierarchy import Hierarchy
+from retwin.inference.hierarchy import Hierarchy, Likelihood
 from retwin.inference.noise import Noise
 from retwin.inference.solver import Solution, blocks
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.first_missed import first_missed
+from retwin.update.corrections.held_out_conditions import regression_predicts_better
 from retwin.update.corrections.missed_segments import (
     CommandFit,
     LatentPrior,
@@ -31,7 +32,7 @@ from retwin.update.corrections.missed_segments import (
     fitted,
     searched,
 )
-from retwin.update.corrections.offset_features import OffsetFeatures
+from retwin.update.corrections.offset_features import FIRST_OFFSET, OffsetFeatures
 from retwin.update.corrections.sample_noise import SampleNoise
 from retwin.workers.threads import one_thread
 
@@ -39,9 +40,6 @@ MAX_ROUNDS = 12
 """Rounds of expectation-maximisation at most, with a search for missed segments in each."""
 TOLERANCE = 0.02
 """Relative change of all standard deviations below which they have converged."""
-DELAY_VARIANCE = 1 / 12
-"""Variance of the delays that the hyperprior expects, in samples squared: that of the time of an
-event within a sample."""
 SUSPECT = 2.5
 """Standard deviations of the prior beyond which an offset makes a segment suspect."""
 MOVING = 3.0
@@ -50,8 +48,6 @@ OUTLYING = 3.0
 """Noise scales beyond which a sample is an outlier."""
 OUTLYING_SHARE = 0.3
 """Share of outliers above which a segment is suspect."""
-FIRST_OFFSET = 0.05
-"""Standard deviation of an offset at first, in that of the commands' targets."""
 FIRST_ODDS = -4.0
 """Log odds at first that an actuator misses a segment: about one in fifty."""
 FIRST_JITTER = 1 / 35
@@ -110,14 +106,18 @@ def infer_commands(
         return given.learned(problem.with_missed(found.fit.missed), found.fit.solution)
 
     fit = CommandFit.of_prior(problem, first.prior(problem), start)
-    found, learned = expectation_maximisation(
-        MissedSearch(fit, fit.missed, fit.evidence),
-        first,
-        infer=infer,
-        learn=learn,
-        rounds=MAX_ROUNDS,
-        converged=Hyperparameters.near,
-    )
+    found, learned = MissedSearch(fit, fit.missed, fit.evidence), first
+    for regression in (False, True):
+        if regression and not learned.explained(problem, found.fit):
+            break
+        found, learned = expectation_maximisation(
+            found,
+            learned.with_regression(problem) if regression else learned,
+            infer=infer,
+            learn=learn,
+            rounds=MAX_ROUNDS,
+            converged=Hyperparameters.near,
+        )
     if uncertain.common is not None:
         problem = uncertain
         found = infer(MissedSearch(fit, fit.missed, fit.evidence), learned)
@@ -207,7 +207,8 @@ class Hyperparameters:
         moved = (problem.distance * (1 - problem.missed) > 0).any(dim=-1) & problem.valid
         shown = moved if moved.any() else problem.valid
         delay = problem.per_segment(start)[..., 0][shown]
-        jitter = 1.4826 * (delay - delay.median()).abs().median() + FIRST_JITTER * problem.width
+        deviation = 1.4826 * (delay - delay.median()).abs().median()
+        jitter = deviation + FIRST_JITTER * problem.width
         measured = problem.measured > 0
         # The median of nothing is NaN.
         length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
@@ -229,6 +230,20 @@ class Hyperparameters:
             Noise(scale, one),
         )
 
+    def explained(self, problem: CommandProblem, fit: CommandFit) -> bool:
+        """Whether a regression predicts offsets under new conditions better than a constant."""
+        problem = self.whitened(problem.with_missed(fit.missed))
+        prior = self.prior(problem)
+        solution = fitted(problem, prior, self.noise, fit.x).solution
+        likelihood = Likelihood.of(solution, prior.gaussian)
+        return regression_predicts_better(self.features, self.hierarchy, problem, likelihood)
+
+    def with_regression(self, problem: CommandProblem) -> Hyperparameters:
+        """The same to begin with, where offsets depend on direction, distance and pose."""
+        features = replace(self.features, regression=True)
+        adapted = self.hierarchy.adapted(features.design(problem))
+        return replace(self, features=features, hierarchy=adapted)
+
     def whitened(self, problem: CommandProblem) -> CommandProblem:
         """The problem in which the errors of a sample's outputs are independent."""
         return replace(problem, whitening=self.samples.whitening())
@@ -240,34 +255,42 @@ class Hyperparameters:
 
     def learned(self, problem: CommandProblem, solution: Solution) -> Hyperparameters:
         """The most probable hyperparameters, given what was inferred and how certain that is."""
-        white, x = self.whitened(problem), solution.x
+        white, x, design = self.whitened(problem), solution.x, self.features.design(problem)
         samples = self.samples.learned(white, self.noise, x)
         white = replace(white, whitening=samples.whitening())
-        # Offsets are expected to be a share of what the actuators travel, the same for all.
-        spread, variance = self.features.spread.square(), self.hierarchy.variance
-        share, delay = (variance[1:-1] / spread).mean(), variance.new_tensor([DELAY_VARIANCE])
-        expected = torch.cat([delay, share * spread, delay])
         return Hyperparameters(
             self.features,
-            self.hierarchy.learned(self.features.design(problem), solution, expected),
+            self.hierarchy.learned(design, Likelihood.of(solution, self.hierarchy.prior(design))),
             _odds(problem),
             samples,
             self._noise(white, solution),
         )
 
     def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
-        """The noise of residuals, of which z* has fitted a part: few samples seem too exact."""
-        learned = white.learned_noise(self.noise, white.residual(solution.x), floor=FLOOR)
-        open_ = (self.prior(white).gaussian.precision * solution.covariance).sum()
-        fitted = solution.x.numel() - open_  # components of x that the outputs determine
+        """The noise of residuals, of which z* has fitted a part: few samples seem too exact.
+
+        Errors of the path between two levels are those of all replicates of a condition, so that
+        these count once (Kish, Survey Sampling, 1965: the mean size of a sample's cluster).
+        """
+        residual = white.residual(solution.x)
+        learned = white.learned_noise(self.noise, residual, floor=FLOOR)
+        size = self.features.conditions(white)[white.valid].unique(dim=0, return_counts=True)[1]
+        replicates = size.double().square().sum() / size.sum().clamp_min(1)
+        own, path = learned.thinning
+        design = self.features.design(white)
+        likelihood = Likelihood.of(solution, self.hierarchy.prior(design))
+        covariance = self.hierarchy.posterior_covariance(design, likelihood)
+        fitted = (likelihood.curvature * covariance).sum()  # dimensions that outputs determine
         count = white.measured.sum() * white.observed.shape[2]
         left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
-        return replace(learned, scale=learned.scale / left.sqrt())
+        rest = own.clamp_min(white.creep(learned, residual))
+        thinning = torch.stack([rest, path * replicates.clamp_min(1)])
+        return replace(learned, scale=learned.scale / left.sqrt(), thinning=thinning)
 
     def near(self, other: Hyperparameters) -> bool:
         """Whether all standard deviations are about those of `other`."""
         pairs = (
-            (self.hierarchy.variance.sqrt(), other.hierarchy.variance.sqrt()),
+            (self.hierarchy.total().sqrt(), other.hierarchy.total().sqrt()),
             (self.noise.scale, other.noise.scale),
         )
         return all(bool(((a / b).log().abs() < TOLERANCE).all()) for a, b in pairs)
@@ -286,13 +309,14 @@ def _discrepancy(
     design = hyperparameters.features.design(problem)
     prior = hyperparameters.prior(problem).gaussian
     common = _common(problem)
+    found, covariance = hierarchy.integrated(design, Likelihood.of(solution, prior))
     x, mean = (
-        (common @ problem.per_segment(each)[..., None])[..., 0] for each in (solution.x, prior.mean)
+        (common @ problem.per_segment(each)[..., None])[..., 0] for each in (found, prior.mean)
     )
     inner, wide = (
-        common @ blocks(each, segments) @ common.mT
-        for each in (hierarchy.posterior_covariance(design, solution), prior.covariance)
+        common @ blocks(each, segments) @ common.mT for each in (covariance, prior.covariance)
     )
+    x[..., 0].clamp_(*problem.delay_range)
     left, wide = inner.diagonal(dim1=-2, dim2=-1), wide.diagonal(dim1=-2, dim2=-1)
     severity = torch.where(problem.faulty, (x - mean)[..., 1:], 0.0)
     # Under a fault nothing was learned of the discrepancy: the prior stands.
@@ -303,7 +327,7 @@ def _discrepancy(
     bounded = at_bound(delay, problem.delay_range) & problem.valid
     known[..., 0] &= ~bounded
     known[..., 1:] &= missed < 0.5
-    own = torch.cat([wide[..., :1], hierarchy.variance[1:-1].expand_as(severity)], dim=-1)
+    own = torch.cat([wide[..., :1], hierarchy.total()[1:-1].expand_as(severity)], dim=-1)
     inner = inner * learned[..., None] * learned[..., None, :]
     inner = inner + torch.diag_embed(own * (1 - learned))
     covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))
