@@ -112,6 +112,11 @@ class Likelihood:
         curvature = solution.curvature - prior.precision
         return cls(curvature, solution.x, prior.gradient(solution.x) - solution.gradient)
 
+    def weighted(self, weight: Tensor) -> Likelihood:
+        """The same to a power (R,), where rows err alike."""
+        curvature = self.curvature * weight[:, None, None]
+        return Likelihood(curvature, self.x, self.slope * weight[:, None])
+
     def without(self, left_out: Tensor) -> Likelihood:
         """The same without the outputs that depend on the variables `left_out` (R, P) bool."""
         kept = (~left_out).to(self.x)
@@ -238,17 +243,25 @@ class Hierarchy:
         """Log evidence of the variances, up to a number that depends on the likelihood alone."""
         return float(self._posterior(design, likelihood).evidence)
 
-    def integrated(self, design: Design, likelihood: Likelihood) -> tuple[Tensor, Tensor]:
-        """Mean (R, P) and covariance (R, P, P) of x, over all hyperparameters that are probable."""
+    def integrated(
+        self, design: Design, likelihood: Likelihood, learned_from: Likelihood | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Mean (R, P) and covariance (R, P, P) of x, over all variances that are probable.
+
+        Variances are those of `learned_from`, if it is another likelihood than that of x (a cut
+        posterior: Plummer, Stat. Comput. 25, 37, 2015).
+        """
         rng = np.random.default_rng(0)
         means, covariances, given = [], [], self
         for count in range(WARM_UP + DRAWS):
-            found = given._posterior(design, likelihood)
+            drawn = found = given._posterior(design, learned_from or likelihood)
             if count >= WARM_UP:
+                if learned_from is not None:
+                    found = given._posterior(design, likelihood)
                 means.append(found.origin + found.moved @ found.beta)
                 spread = found.moved @ found.uncertain @ found.moved.mT
                 covariances.append(found.covariance + spread)
-            given = given._drawn(design, found, rng)
+            given = given._drawn(design, drawn, rng)
         mean = torch.stack(means).mean(dim=0)
         away = torch.stack(means, dim=1) - mean[:, None]
         return mean, torch.stack(covariances).mean(dim=0) + away.mT @ away / DRAWS

@@ -92,23 +92,31 @@ def infer_commands(
     problem = replace(problem, own_delays=True)
     if not problem.valid.shape[1]:
         return _empty(problem), None
-    uncertain, problem = problem, problem.where_certain
-    start, spread = problem.zero, OffsetFeatures.of(problem).spread
-    problem = problem.with_missed(first_missed(problem, FIRST_OFFSET * spread, FIRST_ODDS))
+    features, start = OffsetFeatures.of(problem), problem.zero
+    replicates = features.replicates(problem)
+    uncertain = problem.counted_once(replicates)
+    problem = uncertain.where_certain
+    missed = first_missed(problem, FIRST_OFFSET * features.spread, FIRST_ODDS)
+    problem = problem.with_missed(missed)
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
-    first = Hyperparameters.of(problem, start)
+    first = Hyperparameters.of(problem, features, start)
+    # Replicates show no more of the variances than one does where the surrogate errs in all alike.
+    weight = torch.where(problem.valid, 1 / replicates, 0.0).sum(dim=1)
+    weight = weight / problem.valid.sum(dim=1).clamp_min(1)
+    if uncertain.common is None:
+        weight = torch.ones_like(weight)
 
     def infer(found: MissedSearch, given: Hyperparameters) -> MissedSearch:
         white, prior, noise = given.whitened(problem), given.prior(problem), given.noise
         return searched(white, prior, noise, found.fit, partial(_suspects, white, prior, noise))
 
     def learn(found: MissedSearch, given: Hyperparameters) -> Hyperparameters:
-        return given.learned(problem.with_missed(found.fit.missed), found.fit.solution)
+        return given.learned(problem.with_missed(found.fit.missed), found.fit.solution, weight)
 
     fit = CommandFit.of_prior(problem, first.prior(problem), start)
     found, learned = MissedSearch(fit, fit.missed, fit.evidence), first
     for regression in (False, True):
-        if regression and not learned.explained(problem, found.fit):
+        if regression and not learned.explained(problem, found.fit, weight):
             break
         found, learned = expectation_maximisation(
             found,
@@ -118,12 +126,15 @@ def infer_commands(
             rounds=MAX_ROUNDS,
             converged=Hyperparameters.near,
         )
+    certain = None
     if uncertain.common is not None:
+        certain = learned.linearised(problem, found.fit).weighted(weight)
         problem = uncertain
         found = infer(MissedSearch(fit, fit.missed, fit.evidence), learned)
-    problem = learned.whitened(problem).with_missed(found.fit.missed)
-    last = fitted(problem, learned.prior(problem), learned.noise, found.fit.x)
-    made = _discrepancy(problem, last.solution, found.probability, learned, identified_below)
+    likelihood = learned.linearised(problem, found.fit)
+    problem = problem.with_missed(found.fit.missed)
+    posterior = learned.hierarchy.integrated(learned.features.design(problem), likelihood, certain)
+    made = _discrepancy(problem, likelihood.x, posterior, found.probability, learned, identified_below)
     return made, learned
 
 
@@ -202,7 +213,9 @@ class Hyperparameters:
     noise: Noise
 
     @classmethod
-    def of(cls, problem: CommandProblem, start: Tensor) -> Hyperparameters:
+    def of(
+        cls, problem: CommandProblem, features: OffsetFeatures, start: Tensor
+    ) -> Hyperparameters:
         """Those before anything is inferred: wide, from first delays only."""
         moved = (problem.distance * (1 - problem.missed) > 0).any(dim=-1) & problem.valid
         shown = moved if moved.any() else problem.valid
@@ -213,7 +226,6 @@ class Hyperparameters:
         # The median of nothing is NaN.
         length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
         scale = length.clamp_min(FLOOR).expand(2, 1)
-        features = OffsetFeatures.of(problem)
         offset = FIRST_OFFSET * features.spread
         design = features.design(problem)
         coefficients = torch.zeros(len(design.owner), dtype=torch.float64)
@@ -230,13 +242,18 @@ class Hyperparameters:
             Noise(scale, one),
         )
 
-    def explained(self, problem: CommandProblem, fit: CommandFit) -> bool:
+    def explained(self, problem: CommandProblem, fit: CommandFit, weight: Tensor) -> bool:
         """Whether a regression predicts offsets under new conditions better than a constant."""
+        likelihood = self.linearised(problem, fit).weighted(weight)
+        problem = problem.with_missed(fit.missed)
+        return regression_predicts_better(self.features, self.hierarchy, problem, likelihood)
+
+    def linearised(self, problem: CommandProblem, fit: CommandFit) -> Likelihood:
+        """The likelihood of x at the most probable one, if the segments of `fit` were missed."""
         problem = self.whitened(problem.with_missed(fit.missed))
         prior = self.prior(problem)
         solution = fitted(problem, prior, self.noise, fit.x).solution
-        likelihood = Likelihood.of(solution, prior.gaussian)
-        return regression_predicts_better(self.features, self.hierarchy, problem, likelihood)
+        return Likelihood.of(solution, prior.gaussian)
 
     def with_regression(self, problem: CommandProblem) -> Hyperparameters:
         """The same to begin with, where offsets depend on direction, distance and pose."""
@@ -253,38 +270,38 @@ class Hyperparameters:
         gaussian = self.hierarchy.prior(self.features.design(problem))
         return LatentPrior(gaussian, self.odds.expand(problem.missed.shape))
 
-    def learned(self, problem: CommandProblem, solution: Solution) -> Hyperparameters:
-        """The most probable hyperparameters, given what was inferred and how certain that is."""
+    def learned(
+        self, problem: CommandProblem, solution: Solution, weight: Tensor
+    ) -> Hyperparameters:
+        """The most probable hyperparameters, given what was inferred and how certain that is.
+
+        Rows have the `weight` (n,) where variances are learned.
+        """
         white, x, design = self.whitened(problem), solution.x, self.features.design(problem)
         samples = self.samples.learned(white, self.noise, x)
         white = replace(white, whitening=samples.whitening())
+        likelihood = Likelihood.of(solution, self.hierarchy.prior(design)).weighted(weight)
         return Hyperparameters(
             self.features,
-            self.hierarchy.learned(design, Likelihood.of(solution, self.hierarchy.prior(design))),
+            self.hierarchy.learned(design, likelihood),
             _odds(problem),
             samples,
             self._noise(white, solution),
         )
 
     def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
-        """The noise of residuals, of which z* has fitted a part: few samples seem too exact.
-
-        Errors of the path between two levels are those of all replicates of a condition, so that
-        these count once (Kish, Survey Sampling, 1965: the mean size of a sample's cluster).
-        """
+        """The noise of residuals, of which z* has fitted a part: few samples seem too exact."""
         residual = white.residual(solution.x)
         learned = white.learned_noise(self.noise, residual, floor=FLOOR)
-        size = self.features.conditions(white)[white.valid].unique(dim=0, return_counts=True)[1]
-        replicates = size.double().square().sum() / size.sum().clamp_min(1)
-        own, path = learned.thinning
         design = self.features.design(white)
         likelihood = Likelihood.of(solution, self.hierarchy.prior(design))
         covariance = self.hierarchy.posterior_covariance(design, likelihood)
         fitted = (likelihood.curvature * covariance).sum()  # dimensions that outputs determine
         count = white.measured.sum() * white.observed.shape[2]
         left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
-        rest = own.clamp_min(white.creep(learned, residual))
-        thinning = torch.stack([rest, path * replicates.clamp_min(1)])
+        rest, path = learned.thinning
+        rest = rest.clamp_min(white.creep(learned, residual))
+        thinning = torch.stack([rest, path])
         return replace(learned, scale=learned.scale / left.sqrt(), thinning=thinning)
 
     def near(self, other: Hyperparameters) -> bool:
@@ -298,18 +315,22 @@ class Hyperparameters:
 
 def _discrepancy(
     problem: CommandProblem,
-    solution: Solution,
+    at: Tensor,
+    posterior: tuple[Tensor, Tensor],
     probability: Tensor,
     hyperparameters: Hyperparameters,
     identified_below: float,
 ) -> Discrepancy:
-    """z*, each segment's covariance, and which components the outputs identify."""
+    """z*, each segment's covariance, and which components the outputs identify.
+
+    The posterior, mean (n, P) and covariance (n, P, P) of x, was found by linearisation `at` x (n, P).
+    """
     missed, segments = problem.missed, problem.missed.shape[1]
     hierarchy = hyperparameters.hierarchy
     design = hyperparameters.features.design(problem)
     prior = hyperparameters.prior(problem).gaussian
     common = _common(problem)
-    found, covariance = hierarchy.integrated(design, Likelihood.of(solution, prior))
+    found, covariance = posterior
     x, mean = (
         (common @ problem.per_segment(each)[..., None])[..., 0] for each in (found, prior.mean)
     )
@@ -323,7 +344,7 @@ def _discrepancy(
     learned = torch.cat([problem.valid[..., None], problem.healthy], dim=-1).double()
     known = (left < identified_below * wide) & (learned > 0)
     # The common delay is bounded, whatever those of the actuators are.
-    delay = problem.per_segment(solution.x)[..., 0]
+    delay = problem.per_segment(at)[..., 0]
     bounded = at_bound(delay, problem.delay_range) & problem.valid
     known[..., 0] &= ~bounded
     known[..., 1:] &= missed < 0.5

@@ -69,7 +69,8 @@ class CommandProblem:
         (n, S), the samples used of each trajectory, in order. A trajectory that has fewer than S
         repeats its last one.
     measured : Tensor
-        (n, S), 1 where `sample` was measured, 0 where it only fills the row.
+        (n, S), 1 where `sample` was measured, less where replicates err alike, 0 where it only
+        fills the row.
     group : Tensor
         (n, S) long, 1 where a segment may be in motion, where the surrogate is less accurate; 0 at
         rest.
@@ -185,6 +186,21 @@ class CommandProblem:
         }
         return replace(self, **parts)
 
+    def counted_once(self, replicates: Tensor) -> CommandProblem:
+        """The same where all replicates of a segment, (n, M) in number, err alike.
+
+        In motion they do, because paths between two levels are the same: all of them count as one.
+        The surrogate's error is the same, too.
+        """
+        own = self.inside
+        times = (own.mT @ replicates[..., None])[..., 0] + 1 - own.sum(dim=1)
+        moving, common = self.group == 1, self.common
+        if common is not None:
+            block = torch.where(moving, common.block, common.block * times)
+            common = CommonError(common.variance, block)
+        measured = torch.where(moving, self.measured / times, self.measured)
+        return replace(self, measured=measured, common=common)
+
     def with_missed(self, missed: Tensor) -> CommandProblem:
         """The same if the actuators missed other segments, (n, M, d_u)."""
         return replace(self, missed=missed)
@@ -290,7 +306,7 @@ class CommandProblem:
     def inside(self) -> Tensor:
         """(n, M, S), 1 where a measured sample belongs to a segment."""
         segment = within(self.sample, self.segments.start, np.ceil(self.segments.stop) - 1)
-        return segment.double() * self.measured[:, None]
+        return segment.double() * (self.measured > 0)[:, None]
 
     @property
     def levels(self) -> tuple[Tensor, Tensor]:

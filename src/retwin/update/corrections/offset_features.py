@@ -86,6 +86,14 @@ class OffsetFeatures:
         )
         return torch.cat([first, last], dim=-1)
 
+    def replicates(self, problem: CommandProblem) -> Tensor:
+        """(n, M), the number of segments of the same condition."""
+        every = self.conditions(problem).flatten(0, 1)
+        index = every.unique(dim=0, return_inverse=True)[1]
+        valid = problem.valid.flatten().double()
+        counts = torch.zeros_like(valid).index_add(0, index, valid)
+        return counts[index].clamp_min(1).view(problem.valid.shape)
+
     def design(self, problem: CommandProblem) -> Design:
         """The regression of x on a common delay, features of the offsets, and conditions.
 
