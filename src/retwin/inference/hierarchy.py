@@ -113,15 +113,10 @@ class Likelihood:
         return cls(curvature, solution.x, prior.gradient(solution.x) - solution.gradient)
 
     def weighted(self, weight: Tensor) -> Likelihood:
-        """The same to a power (R,), where rows err alike."""
-        curvature = self.curvature * weight[:, None, None]
-        return Likelihood(curvature, self.x, self.slope * weight[:, None])
-
-    def without(self, left_out: Tensor) -> Likelihood:
-        """The same without the outputs that depend on the variables `left_out` (R, P) bool."""
-        kept = (~left_out).to(self.x)
-        curvature = self.curvature * kept[:, :, None] * kept[:, None, :]
-        return Likelihood(curvature, self.x, self.slope * kept)
+        """The same to a power, (R, 1) or by variable (R, P): 0 without what depends on it."""
+        root = weight.sqrt()
+        curvature = self.curvature * root[:, :, None] * root[:, None, :]
+        return Likelihood(curvature, self.x, self.slope * weight)
 
 
 @dataclass(frozen=True, eq=False)

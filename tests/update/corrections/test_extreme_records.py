@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ import retwin as rt
 from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise
 from retwin.update.corrections.command_problem import COMMON_ERROR, CommandProblem
+from retwin.update.corrections.offset_features import OffsetFeatures
 
 RATE = 50.0
 OPERATORS = (rt.DelayOffset, rt.CommandSpace)
@@ -223,12 +226,32 @@ def test_the_mean_of_a_rest_errs_by_what_actuators_creep(walks: bool) -> None:
     np.testing.assert_allclose(error, count / 3 if walks else independent, rtol=0.25)
 
 
-def test_replicates_of_a_motion_count_once() -> None:
-    """What a path between two levels errs is the same in all four of them; at rest it is not."""
-    thinning = []
+def test_replicates_count_once_where_they_err_alike() -> None:
+    """A path between two levels is the same in all four of them, and so is the surrogate's error.
+
+    Noise at rest is not. The surrogate's variance bounds what a segment, or all its
+    replicates together, tell.
+    """
+    count, precision = [], []
     for copies in (1, 4):
         context, _, outputs = measured(Plane(), commands_of(5).repeat(copies, axis=0))
         mask = torch.ones(outputs.shape).bool()
-        learned = rt.CommandSpace().infer_with_hyperparameters(context, outputs, mask)[1]
-        thinning.append(learned.noise.thinning.numpy())
-    np.testing.assert_allclose(thinning[1] / thinning[0], [1.0, 4.0], rtol=0.2)
+        problem = CommandProblem.of(context, outputs, mask, delay_range=(0.0, 8.0), max_samples=400)
+        noise = Noise(torch.ones(2, 1).double(), torch.ones(2).double(), StudentT(1e6))
+        error = torch.full((*problem.valid.shape, 2), 1e4 * problem.unit.square().mean())
+        unsure = CommandProblem.of(
+            replace(context, surrogate_variance=error * problem.valid[..., None]),
+            outputs,
+            mask,
+            delay_range=(0.0, 8.0),
+            max_samples=400,
+        )
+        replicates = OffsetFeatures.of(problem).replicates(problem)
+        assert (replicates[problem.valid] == copies).all()
+        each = noise.count(problem.counted_once(replicates))
+        count.append([float(each[problem.group == k].sum()) for k in (0, 1)])
+        bounded = unsure.counted_once(replicates)
+        total = noise.precision(bounded, torch.zeros_like(problem.observed))[..., 0]
+        precision.append(float((problem.inside[:, 0] * total).sum()))
+    np.testing.assert_allclose(np.divide(count[1], count[0]), [4.0, 1.0])
+    np.testing.assert_allclose(precision[1] / precision[0], 1.0, rtol=0.01)

@@ -101,10 +101,9 @@ def infer_commands(
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
     first = Hyperparameters.of(problem, features, start)
     # Replicates show no more of the variances than one does where the surrogate errs in all alike.
-    weight = torch.where(problem.valid, 1 / replicates, 0.0).sum(dim=1)
-    weight = weight / problem.valid.sum(dim=1).clamp_min(1)
-    if uncertain.common is None:
-        weight = torch.ones_like(weight)
+    weight = torch.ones_like(start[:, :1])
+    if uncertain.common is not None:
+        weight = (1 / replicates).mean(dim=1, keepdim=True)
 
     def infer(found: MissedSearch, given: Hyperparameters) -> MissedSearch:
         white, prior, noise = given.whitened(problem), given.prior(problem), given.noise
@@ -134,7 +133,9 @@ def infer_commands(
     likelihood = learned.linearised(problem, found.fit)
     problem = problem.with_missed(found.fit.missed)
     posterior = learned.hierarchy.integrated(learned.features.design(problem), likelihood, certain)
-    made = _discrepancy(problem, likelihood.x, posterior, found.probability, learned, identified_below)
+    made = _discrepancy(
+        problem, likelihood.x, posterior, found.probability, learned, identified_below
+    )
     return made, learned
 
 
@@ -275,7 +276,7 @@ class Hyperparameters:
     ) -> Hyperparameters:
         """The most probable hyperparameters, given what was inferred and how certain that is.
 
-        Rows have the `weight` (n,) where variances are learned.
+        Rows have the `weight` (n, 1) where variances are learned.
         """
         white, x, design = self.whitened(problem), solution.x, self.features.design(problem)
         samples = self.samples.learned(white, self.noise, x)
@@ -323,11 +324,11 @@ def _discrepancy(
 ) -> Discrepancy:
     """z*, each segment's covariance, and which components the outputs identify.
 
-    The posterior, mean (n, P) and covariance (n, P, P) of x, was found by linearisation `at` x (n, P).
+    The posterior, mean (n, P) and covariance (n, P, P) of x, is that of the problem linearised `at`
+    x (n, P).
     """
     missed, segments = problem.missed, problem.missed.shape[1]
     hierarchy = hyperparameters.hierarchy
-    design = hyperparameters.features.design(problem)
     prior = hyperparameters.prior(problem).gaussian
     common = _common(problem)
     found, covariance = posterior

@@ -65,8 +65,8 @@ def _density(
     start = hierarchy.adapted(design).learned(design, likelihood)
     densities = []
     for fold in folds:
-        left_out = fold.flatten(1)
-        rest = likelihood.without(left_out)
-        found = start.learned(replace(design, used=design.used * ~left_out), rest)
+        kept = (~fold).flatten(1).to(design.used)
+        rest = likelihood.weighted(kept)
+        found = start.learned(replace(design, used=design.used * kept), rest)
         densities.append(found.evidence(design, likelihood) - found.evidence(design, rest))
     return torch.tensor(densities)
