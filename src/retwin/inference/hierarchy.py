@@ -201,21 +201,23 @@ class Hierarchy:
         return replace(made, variance=self.variance, common=self.common)
 
     def prior(self, design: Design) -> GaussianPrior:
-        """The distribution of x at the most probable coefficients."""
-        return GaussianPrior.independent(
-            design.features @ self.coefficients, self._variances(design)
-        )
+        """The distribution of x at the most probable coefficients.
+
+        Effects of conditions are as uncertain as they are: those that nothing shows are free.
+        """
+        effect = torch.where(design.kind == CONDITION, self.covariance.diagonal(), 0.0)
+        variances = self._variances(design) + design.features.square() @ effect
+        return GaussianPrior.independent(design.features @ self.coefficients, variances)
 
     def posterior_covariance(self, design: Design, likelihood: Likelihood) -> Tensor:
         """Covariance (R, P, P) of x; that the coefficients are uncertain is accounted for."""
         found = self._posterior(design, likelihood)
         return found.covariance + found.moved @ found.uncertain @ found.moved.mT
 
-    def information(self, design: Design, solution: Solution) -> Tensor:
+    def information(self, design: Design, likelihood: Likelihood) -> Tensor:
         """(R, F, F) the information of each row about the coefficients, with x integrated out."""
         weighted = design.features / self._variances(design)[..., None]
-        left = design.features - solution.covariance @ weighted
-        return weighted.mT @ left
+        return weighted.mT @ (design.features - self._posterior(design, likelihood).moved)
 
     def scatter(self, design: Design) -> Tensor:
         """(R, P) variances of x when the coefficients are known."""
