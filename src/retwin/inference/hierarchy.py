@@ -1,17 +1,23 @@
 """A prior whose mean is a regression, and whose hyperparameters all rows together decide.
 
 The latent variables are x = H β + ε. The errors ε are independent, with one variance for each group
-of variables; the coefficients β are common to all rows and shrunk to 0, with a variance for each
-kind of coefficient, relative to that of the group they belong to. Variances are learned by
-expectation-maximisation on the linearised problem, in which x and β have a closed form (type-II
-maximum likelihood with weak, fixed hyperpriors; automatic relevance determination: MacKay, Neural
-Comput. 4, 415, 1992; Tipping, J. Mach. Learn. Res. 1, 211, 2001).
+of variables. The coefficients β are common to all rows, and normal with mean 0: those of a kind
+share a variance in squares of their owners' units; the effect of a condition, which its replicates
+share, has a variance for each group. Replicates show the errors; only other conditions show more of
+what a single one leaves open.
+
+The most probable variances are found by expectation-maximisation on the linearised problem, in
+which x and β have a closed form (type-II maximum likelihood with weak hyperpriors; automatic
+relevance determination: MacKay, Neural Comput. 4, 415, 1992; Tipping, J. Mach. Learn. Res. 1, 211,
+2001). What x may be is integrated over all variances that are probable, by Gibbs sampling (Gelman,
+Bayesian Anal. 1, 515, 2006): what outputs leave open depends on their ratios.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,14 +27,19 @@ from retwin.inference.solver import Solution
 FREEDOM = 2.0
 """Degrees of freedom of the scaled inverse chi-squared hyperpriors: what a variance is expected to
 be counts as much as two observations."""
-RELATIVE = 0.01
-"""Expected variance of a coefficient relative to that of its group: small unless data say more."""
 TOLERANCE = 1e-3
 """Relative change of all variances below which they have converged."""
 MAX_STEPS = 200
 """Steps of expectation-maximisation at most."""
-FLAT = 0
-"""The kind of coefficients that are not shrunk to 0."""
+LARGEST = 1e3
+"""Largest standard deviation, in units: what outputs hardly show is linear no further."""
+JITTER = 1e-13
+"""Added to the diagonal, relative to its largest element, where rounding makes a curvature
+indefinite."""
+WARM_UP, DRAWS = 20, 100
+"""Draws of the variances that are left out first, and that are then averaged over."""
+FLAT, CONDITION = 0, -1
+"""The kinds of coefficients whose prior is given, and that are the effects of conditions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +59,19 @@ class Design:
     owner : Tensor
         (F,) long, the group that each coefficient belongs to.
     kind : Tensor
-        (F,) long, the kind of each coefficient; K in all. Those of kind 0 are not shrunk.
+        (F,) long, the kind of each coefficient, 0 to K - 1, or `CONDITION`. Those of kind 0 have a
+        prior of their own.
+    single : Tensor
+        (R, P), 1 where the error of a variable includes the effect of a condition, because its
+        condition has no replicate, else 0.
+    tied : tuple of int
+        The first of the groups whose variances, in squares of their units, are expected to be
+        alike, and the one after the last.
+    unit : Tensor
+        (G,), the unit of the variables of each group.
+    share : Tensor
+        (K,), expected variance of the coefficients of each kind, relative to that of the tied
+        groups.
 
     """
 
@@ -58,6 +81,72 @@ class Design:
     used: Tensor
     owner: Tensor
     kind: Tensor
+    single: Tensor
+    tied: tuple[int, int]
+    unit: Tensor
+    share: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Likelihood:
+    """The linearised problem: curvature and gradient of the log likelihood at some x.
+
+    Attributes
+    ----------
+    curvature : Tensor
+        (R, P, P), of minus the log likelihood.
+    x : Tensor
+        (R, P).
+    slope : Tensor
+        (R, P), gradient of the log likelihood at x.
+
+    """
+
+    curvature: Tensor
+    x: Tensor
+    slope: Tensor
+
+    @classmethod
+    def of(cls, solution: Solution, prior: GaussianPrior) -> Likelihood:
+        """That of a solution which was found for a prior."""
+        curvature = solution.curvature - prior.precision
+        return cls(curvature, solution.x, prior.gradient(solution.x) - solution.gradient)
+
+    def weighted(self, weight: Tensor) -> Likelihood:
+        """The same to a power, (R, 1) or by variable (R, P): 0 without what depends on it."""
+        root = weight.sqrt()
+        curvature = self.curvature * root[:, :, None] * root[:, None, :]
+        return Likelihood(curvature, self.x, self.slope * weight)
+
+
+@dataclass(frozen=True, eq=False)
+class _Posterior:
+    """x and β for given variances: β is normal, and so is x for a given β.
+
+    Attributes
+    ----------
+    factor : Tensor
+        (R, P, P), lower factor of the precision of x in standard deviations of its errors.
+    covariance : Tensor
+        (R, P, P), of x for given β.
+    origin : Tensor
+        (R, P), mean of x for β = 0.
+    moved : Tensor
+        (R, P, F), derivative of the mean of x by β.
+    beta, uncertain : Tensor
+        (F,) and (F, F), mean and covariance of β.
+    evidence : Tensor
+        (), log evidence of the variances, up to a number that depends on the likelihood alone.
+
+    """
+
+    factor: Tensor
+    covariance: Tensor
+    origin: Tensor
+    moved: Tensor
+    beta: Tensor
+    uncertain: Tensor
+    evidence: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +157,10 @@ class Hierarchy:
     ----------
     variance : Tensor
         (G,), of the errors of each group.
+    common : Tensor
+        (G,), of the effects that conditions have on each group; 0 if nothing is replicated.
     relative : Tensor
-        (K,), variance of the coefficients of each kind, relative to that of their group.
+        (K,), variance of the coefficients of each kind, in squares of their owners' units.
     coefficients : Tensor
         (F,), posterior mean.
     covariance : Tensor
@@ -80,6 +171,7 @@ class Hierarchy:
     """
 
     variance: Tensor
+    common: Tensor
     relative: Tensor
     coefficients: Tensor
     covariance: Tensor
@@ -94,106 +186,234 @@ class Hierarchy:
         flat: tuple[float, float] = (0.0, torch.inf),
     ) -> Hierarchy:
         """The hyperparameters to begin with: variances (G,), certain coefficients (F,)."""
-        kinds = int(design.kind.amax()) + 1
         count = len(coefficients)
-        return cls(
-            variance,
-            variance.new_full((kinds,), RELATIVE),
-            coefficients,
-            variance.new_zeros(count, count),
-            flat,
-        )
+        common = variance * float((design.kind == CONDITION).any())
+        level = _level(design, variance)
+        certain = variance.new_zeros(count, count)
+        return cls(variance, common, design.share * level, coefficients, certain, flat)
+
+    def adapted(self, design: Design) -> Hierarchy:
+        """The same variances of errors to begin with for another regression."""
+        coefficients = self.variance.new_zeros(len(design.owner))
+        flat = design.kind == FLAT
+        coefficients[flat] = self.coefficients[: int(flat.sum())]
+        made = Hierarchy.of(design, self.total(), coefficients, self.flat)
+        return replace(made, variance=self.variance, common=self.common)
 
     def prior(self, design: Design) -> GaussianPrior:
-        """The distribution of x at the most probable coefficients."""
-        return GaussianPrior.independent(
-            design.features @ self.coefficients, self._variances(design)
-        )
+        """The distribution of x at the most probable coefficients.
 
-    def posterior_covariance(self, design: Design, solution: Solution) -> Tensor:
+        Effects of conditions are as uncertain as they are: those that nothing shows are free.
+        """
+        effect = torch.where(design.kind == CONDITION, self.covariance.diagonal(), 0.0)
+        variances = self._variances(design) + design.features.square() @ effect
+        return GaussianPrior.independent(design.features @ self.coefficients, variances)
+
+    def posterior_covariance(self, design: Design, likelihood: Likelihood) -> Tensor:
         """Covariance (R, P, P) of x; that the coefficients are uncertain is accounted for."""
-        covariance = solution.covariance
-        weighted = design.features / self._variances(design)[..., None]
-        shift = covariance @ weighted
-        return covariance + shift @ self.covariance @ shift.mT
+        found = self._posterior(design, likelihood)
+        return found.covariance + found.moved @ found.uncertain @ found.moved.mT
 
-    def information(self, design: Design, solution: Solution) -> Tensor:
+    def information(self, design: Design, likelihood: Likelihood) -> Tensor:
         """(R, F, F) the information of each row about the coefficients, with x integrated out."""
         weighted = design.features / self._variances(design)[..., None]
-        left = design.features - solution.covariance @ weighted
-        return weighted.mT @ left
+        return weighted.mT @ (design.features - self._posterior(design, likelihood).moved)
 
     def scatter(self, design: Design) -> Tensor:
         """(R, P) variances of x when the coefficients are known."""
         return self._variances(design)
 
-    def learned(self, design: Design, solution: Solution, expected: Tensor) -> Hierarchy:
-        """The most probable hyperparameters for the problem linearised at its solution.
+    def total(self) -> Tensor:
+        """(G,) variances of x about the regression, under conditions that have no replicate."""
+        return self.variance + self.common
 
-        Parameters
-        ----------
-        design : Design
-            Of all rows.
-        solution : Solution
-            For the prior that these hyperparameters give.
-        expected : Tensor
-            (G,), the variance of each group that the hyperprior expects.
-
-        """
-        prior = self.prior(design)
-        # The likelihood of the linearised problem: its curvature, and its slope at the solution.
-        curvature = solution.curvature - prior.precision
-        slope = prior.gradient(solution.x) - solution.gradient
+    def learned(self, design: Design, likelihood: Likelihood) -> Hierarchy:
+        """The most probable hyperparameters for the linearised problem."""
         found = self
         for _ in range(MAX_STEPS):
-            before, found = found, found._step(design, curvature, solution.x, slope, expected)
-            if (found.variance / before.variance).log().abs().amax() < TOLERANCE:
+            before, found = found, found._step(design, likelihood)
+            if (found.total() / before.total()).log().abs().amax() < TOLERANCE:
                 break
         return found
 
-    def _variances(self, design: Design) -> Tensor:
-        return self.variance[design.group] * design.wider.square()
+    def evidence(self, design: Design, likelihood: Likelihood) -> float:
+        """Log evidence of the variances, up to a number that depends on the likelihood alone."""
+        return float(self._posterior(design, likelihood).evidence)
 
-    def _step(
-        self, design: Design, curvature: Tensor, x: Tensor, slope: Tensor, expected: Tensor
-    ) -> Hierarchy:
-        """One step: the posterior of coefficients and x, then the variances."""
+    def integrated(
+        self, design: Design, likelihood: Likelihood, learned_from: Likelihood | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Mean (R, P) and covariance (R, P, P) of x, over all variances that are probable.
+
+        Variances are those of `learned_from`, if it is another likelihood than that of x (a cut
+        posterior: Plummer, Stat. Comput. 25, 37, 2015).
+        """
+        rng = np.random.default_rng(0)
+        means, covariances, given = [], [], self
+        for count in range(WARM_UP + DRAWS):
+            drawn = found = given._posterior(design, learned_from or likelihood)
+            if count >= WARM_UP:
+                if learned_from is not None:
+                    found = given._posterior(design, likelihood)
+                means.append(found.origin + found.moved @ found.beta)
+                spread = found.moved @ found.uncertain @ found.moved.mT
+                covariances.append(found.covariance + spread)
+            given = given._drawn(design, drawn, rng)
+        mean = torch.stack(means).mean(dim=0)
+        away = torch.stack(means, dim=1) - mean[:, None]
+        return mean, torch.stack(covariances).mean(dim=0) + away.mT @ away / DRAWS
+
+    def _variances(self, design: Design) -> Tensor:
+        own, effect = self.variance[design.group], self.common[design.group]
+        return (own + effect * design.single) * design.wider.square()
+
+    def _posterior(self, design: Design, likelihood: Likelihood) -> _Posterior:
+        """The posterior of x and β for these variances."""
         features, variances = design.features, self._variances(design)
+        x, slope = likelihood.x, likelihood.slope
         precision = variances.reciprocal()
         # In prior standard deviations: what exact outputs leave open keeps the prior's precision
         # beside what they determine, which is larger by many orders.
         scale = variances.sqrt()[:, :, None] * variances.sqrt()[:, None, :]
-        identity = torch.eye(curvature.shape[1], dtype=curvature.dtype)
-        covariance = torch.linalg.inv(curvature * scale + identity) * scale
-        covariance = (covariance + covariance.mT) / 2
+        identity = torch.eye(x.shape[1], dtype=x.dtype)
+        curvature = likelihood.curvature * scale
+        curvature = (curvature + curvature.mT) / 2 + identity
+        factor, failed = torch.linalg.cholesky_ex(curvature)
+        if failed.any():
+            rounding = JITTER * curvature.diagonal(dim1=1, dim2=2).amax(dim=1) * (failed > 0)
+            factor = torch.linalg.cholesky(curvature + rounding[:, None, None] * identity)
+        covariance = torch.cholesky_inverse(factor) * scale
         weighted = features * precision[..., None]
         # With x integrated out, β has this precision, and the errors ε depend on β by -left.
-        left = features - covariance @ weighted
-        own = self.relative[design.kind] * self.variance[design.owner]
+        moved = covariance @ weighted
+        own = self.relative[design.kind.clamp_min(0)] * design.unit[design.owner].square()
         own = torch.where(design.kind == FLAT, self.flat[1], own)
+        own = torch.where(design.kind == CONDITION, self.common[design.owner], own)
         centre = torch.where(design.kind == FLAT, self.flat[0], torch.zeros_like(own))
-        information = (weighted.mT @ left).sum(dim=0) + torch.diag(own.reciprocal())
+        information = (weighted.mT @ (features - moved)).sum(dim=0) + torch.diag(own.reciprocal())
         # Where nothing is measured, nothing is known of coefficients that are not shrunk.
         known = (weighted * features).sum(dim=(0, 1))  # of each coefficient, were x measured
         information = information + torch.diag(ROUNDING * known)
         # As the product of the covariance and the slope at x = 0, without its large numbers.
-        mean = x + (covariance @ (slope - precision * x)[..., None])[..., 0]
+        pull = slope - precision * x
+        step = (covariance @ pull[..., None])[..., 0]
+        origin = x + step
         uncertain = inverse(information[None])[0]
-        beta = uncertain @ ((weighted * mean[..., None]).sum(dim=(0, 1)) + centre / own)
-        error = mean - left @ beta
-        spread = covariance.diagonal(dim1=1, dim2=2) + ((left @ uncertain) * left).sum(dim=-1)
-        second = (error.square() + spread) / design.wider.square() * design.used
-        total, count = (
-            torch.zeros_like(self.variance).index_add(0, design.group, each.sum(dim=0))
-            for each in (second, design.used)
+        right = (weighted * origin[..., None]).sum(dim=(0, 1)) + centre / own
+        beta = uncertain @ right
+        evidence = 0.5 * (
+            (pull * step).sum()
+            - (precision * x.square()).sum()
+            + right @ beta
+            - 2 * factor.diagonal(dim1=1, dim2=2).log().sum()
+            - torch.linalg.slogdet(information)[1]
+            - own[own.isfinite()].log().sum()
         )
-        variance = (total + FREEDOM * expected) / (count + FREEDOM)
-        share = (beta.square() + uncertain.diagonal()) / variance[design.owner]
+        return _Posterior(factor, covariance, origin, moved, beta, uncertain, evidence)
+
+    def _step(self, design: Design, likelihood: Likelihood) -> Hierarchy:
+        """One step: the posterior of coefficients and x, then the variances."""
+        found = self._posterior(design, likelihood)
+        left = design.features - found.moved
+        error = found.origin - left @ found.beta
+        spread = found.covariance.diagonal(dim1=1, dim2=2)
+        spread = spread + ((left @ found.uncertain) * left).sum(dim=-1)
+        second = (error.square() + spread) / design.wider.square()
+        own, effect = self._parts(design)
+        both = own * effect * self.total()[design.group]  # conditional variance of either part
+        beta = found.beta.square() + found.uncertain.diagonal()
+        sums = own.square() * second + both, effect.square() * second + both
+        made = self._maximised(design, *sums, beta, None)
+        return replace(made, coefficients=found.beta, covariance=found.uncertain)
+
+    def _drawn(self, design: Design, found: _Posterior, rng: np.random.Generator) -> Hierarchy:
+        """Variances from their distribution for a β and an x that are drawn."""
+
+        def normal(like: Tensor) -> Tensor:
+            return torch.from_numpy(rng.standard_normal(tuple(like.shape)))
+
+        values, vectors = torch.linalg.eigh(found.uncertain)
+        beta = found.beta + vectors @ (values.clamp_min(0).sqrt() * normal(values))
+        noise = normal(found.origin)[..., None]
+        noise = torch.linalg.solve_triangular(found.factor.mT, noise, upper=True)[..., 0]
+        x = found.origin + found.moved @ beta + self._variances(design).sqrt() * noise
+        error = (x - design.features @ beta) / design.wider
+        own, effect = self._parts(design)
+        both = own * effect * self.total()[design.group]
+        part = effect * error + both.sqrt() * normal(error)
+        return self._maximised(design, (error - part).square(), part.square(), beta.square(), rng)
+
+    def _parts(self, design: Design) -> tuple[Tensor, Tensor]:
+        """Shares (R, P) of a variable's variance that are the error's and the condition's."""
+        own = self.variance[design.group]
+        effect = self.common[design.group] * design.single
+        return own / (own + effect), effect / (own + effect)
+
+    def _maximised(
+        self,
+        design: Design,
+        error: Tensor,
+        effect: Tensor,
+        beta: Tensor,
+        rng: np.random.Generator | None,
+    ) -> Hierarchy:
+        """The most probable variances, or drawn ones, for squares of errors, effects and β."""
+        zero = torch.zeros_like(self.variance)
+        used, single = design.used, design.used * design.single
+
+        def grouped(values: Tensor) -> Tensor:
+            return zero.index_add(0, design.group, values.sum(dim=0))
+
+        variance = self._variance(design, grouped(error * used), grouped(used), self.variance, rng)
+        total, count = grouped(effect * single), grouped(single)
+        shown = ((design.features * used[..., None]).abs().sum(dim=(0, 1)) > 0).to(beta)
+        shown = shown * (design.kind == CONDITION)
+        total = total.index_add(0, design.owner, beta * shown)
+        count = count.index_add(0, design.owner, shown)
+        common = self.common
+        if (design.kind == CONDITION).any():
+            common = self._variance(design, total, count, self.common, rng)
+        some = design.kind != CONDITION
+        kind, owner = design.kind[some], design.owner[some]
+        share = beta[some] / design.unit[owner].square()
+        nothing = torch.zeros_like(self.relative)
         sums, counts = (
-            torch.zeros_like(self.relative).index_add(0, design.kind, each)
-            for each in (share, torch.ones_like(share))
+            nothing.index_add(0, kind, each) for each in (share, torch.ones_like(share))
         )
-        relative = (sums + FREEDOM * RELATIVE) / (counts + FREEDOM)
-        return replace(
-            self, variance=variance, relative=relative, coefficients=beta, covariance=uncertain
-        )
+        expected = design.share * _level(design, variance + common)
+        relative = _scaled(sums + FREEDOM * expected, counts + FREEDOM, rng).clamp_max(LARGEST**2)
+        return replace(self, variance=variance, common=common, relative=relative)
+
+    def _variance(
+        self,
+        design: Design,
+        total: Tensor,
+        count: Tensor,
+        before: Tensor,
+        rng: np.random.Generator | None,
+    ) -> Tensor:
+        """Variances (G,) of which sums of squares and numbers of values are known."""
+        first, last = design.tied
+        expected = design.unit.square().clone()
+        expected[first:last] *= _level(design, before, rng)
+        found = _scaled(total + FREEDOM * expected, count + FREEDOM, rng)
+        return found.minimum((LARGEST * design.unit).square())
+
+
+def _scaled(total: Tensor, count: Tensor, rng: np.random.Generator | None) -> Tensor:
+    """The mode of scaled inverse chi-squared distributions, or draws from them."""
+    return total / (count if rng is None else torch.from_numpy(rng.chisquare(count.numpy())))
+
+
+def _level(design: Design, variance: Tensor, rng: np.random.Generator | None = None) -> Tensor:
+    """What variances (G,) of tied groups are expected to be, in squares of their units.
+
+    It is the most probable value, or a draw. Beforehand its root, a standard deviation, is
+    half-normal with a scale of one unit: any smaller one is as probable.
+    """
+    first, last = design.tied
+    if first == last:
+        return variance.new_ones(())
+    precision = FREEDOM * (design.unit.square() / variance)[first:last].sum() + 1
+    count = (last - first) * FREEDOM + 1
+    return (count if rng is None else float(rng.chisquare(count))) / precision

@@ -137,7 +137,7 @@ class Noise:
         scale, thinning = [], []
         for k in range(len(self.scale)):
             part = (problem.measured * (problem.group == k))[..., None]
-            count = part.sum()
+            seen, count = (part[..., 0] > 0).to(part), part.sum()
             if not count:
                 scale.append(self.scale[k])
                 thinning.append(self.thinning[k])
@@ -148,10 +148,10 @@ class Noise:
             variances = variances.clamp_min(lattice)
             scale.append((variances if len(self.scale[k]) > 1 else variances.mean(0, True)).sqrt())
             kept = residual / self.scale[k] * (weights * part).sqrt()
-            time = correlation_time(kept, part[..., 0], rows=False, limit=MAX_CORRELATION)
+            time = correlation_time(kept, seen, rows=False, limit=MAX_CORRELATION)
             # Exact outputs have a scale of 0.
             share = (shared / scale[-1].square().mean().clamp_min(1e-300)).clamp_min(common)
-            thinning.append(time + share * count / blocks)
+            thinning.append(time + share * seen.sum() / blocks)
         scales = torch.stack(scale)
         smallest = max(floor, SMALLEST_SHARE * float(scales.amax()))
         return Noise(scales.clamp_min(smallest), torch.stack(thinning), self.loss)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
 import retwin as rt
+from retwin.inference.losses import StudentT
+from retwin.inference.noise import Noise
+from retwin.update.corrections.command_problem import COMMON_ERROR, CommandProblem
+from retwin.update.corrections.offset_features import OffsetFeatures
 
 RATE = 50.0
 OPERATORS = (rt.DelayOffset, rt.CommandSpace)
@@ -197,3 +203,55 @@ def test_delays_that_noise_could_have_made_are_not_identified(
     # With 20 of 160 or more, 0.8 has a probability above 0.01 where 0.9 is true.
     if share[1]:
         assert torch.cat(covered).double().mean() >= 0.8
+
+
+@pytest.mark.parametrize("walks", [False, True])
+def test_the_mean_of_a_rest_errs_by_what_actuators_creep(walks: bool) -> None:
+    """A walk of n steps of variance q ends away from its mean by a variance of q n / 3."""
+    context, _, outputs = measured(Plane(), commands_of(100))
+    mask = torch.ones(outputs.shape).bool()
+    problem = CommandProblem.of(context, outputs, mask, delay_range=(0.0, 8.0), max_samples=400)
+    rest = problem.inside * (problem.group == 0)[:, None]
+    steps = torch.tensor(np.random.default_rng(5).normal(size=outputs.shape))
+    residual, counts = torch.zeros_like(outputs), rest.sum(dim=-1)
+    for i, m in counts.nonzero().tolist():
+        inside = rest[i, m] > 0
+        values = steps[i, inside].cumsum(dim=0) if walks else steps[i, inside]
+        residual[i, inside] = values - values.mean(dim=0)
+    scale = residual[rest.sum(dim=1) > 0].std(correction=0)
+    noise = Noise(scale.expand(2, 1), torch.ones(2).double(), StudentT(1e6))
+    count = counts[counts > 0].mean()
+    error = noise.scale[0, 0] ** 2 * problem.creep(noise, residual) / count
+    independent = scale**2 * (1 / count + COMMON_ERROR)
+    np.testing.assert_allclose(error, count / 3 if walks else independent, rtol=0.25)
+
+
+def test_replicates_count_once_where_they_err_alike() -> None:
+    """A path between two levels is the same in all four of them, and so is the surrogate's error.
+
+    Noise at rest is not. The surrogate's variance bounds what a segment, or all its
+    replicates together, tell.
+    """
+    count, precision = [], []
+    for copies in (1, 4):
+        context, _, outputs = measured(Plane(), commands_of(5).repeat(copies, axis=0))
+        mask = torch.ones(outputs.shape).bool()
+        problem = CommandProblem.of(context, outputs, mask, delay_range=(0.0, 8.0), max_samples=400)
+        noise = Noise(torch.ones(2, 1).double(), torch.ones(2).double(), StudentT(1e6))
+        error = torch.full((*problem.valid.shape, 2), 1e4 * problem.unit.square().mean())
+        unsure = CommandProblem.of(
+            replace(context, surrogate_variance=error * problem.valid[..., None]),
+            outputs,
+            mask,
+            delay_range=(0.0, 8.0),
+            max_samples=400,
+        )
+        replicates = OffsetFeatures.of(problem).replicates(problem)
+        assert (replicates[problem.valid] == copies).all()
+        each = noise.count(problem.counted_once(replicates))
+        count.append([float(each[problem.group == k].sum()) for k in (0, 1)])
+        bounded = unsure.counted_once(replicates)
+        total = noise.precision(bounded, torch.zeros_like(problem.observed))[..., 0]
+        precision.append(float((problem.inside[:, 0] * total).sum()))
+    np.testing.assert_allclose(np.divide(count[1], count[0]), [4.0, 1.0])
+    np.testing.assert_allclose(precision[1] / precision[0], 1.0, rtol=0.01)

@@ -15,6 +15,7 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.inference.design import Knowledge
+from retwin.inference.hierarchy import Likelihood
 from retwin.inference.solver import solve
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import CommandSpace, Context, Discrepancy, before_sensor, sample_mask
@@ -95,7 +96,8 @@ class ActuatorKnowledge:
         samples = replace(learned.samples, gain=problem.gain())
         problem = replace(problem, observed=expected, whitening=samples.whitening())
         found = solve(problem, prior, learned.noise, prior.mean, bounds=problem.bounds)
-        information = learned.hierarchy.information(learned.features.design(problem), found)
+        likelihood, design = Likelihood.of(found, prior), learned.features.design(problem)
+        information = learned.hierarchy.information(design, likelihood)
         values, vectors = torch.linalg.eigh((information + information.mT) / 2)
         return (vectors * values.clamp_min(0).sqrt()[..., None, :]).mT
 

@@ -17,13 +17,14 @@ from torch import Tensor
 
 from retwin.checks import require
 from retwin.inference.em import expectation_maximisation
-from retwin.inference.hierarchy import Hierarchy
+from retwin.inference.hierarchy import Hierarchy, Likelihood
 from retwin.inference.noise import Noise
 from retwin.inference.solver import Solution, blocks
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.first_missed import first_missed
+from retwin.update.corrections.held_out_conditions import regression_predicts_better
 from retwin.update.corrections.missed_segments import (
     CommandFit,
     LatentPrior,
@@ -31,7 +32,7 @@ from retwin.update.corrections.missed_segments import (
     fitted,
     searched,
 )
-from retwin.update.corrections.offset_features import OffsetFeatures
+from retwin.update.corrections.offset_features import FIRST_OFFSET, OffsetFeatures
 from retwin.update.corrections.sample_noise import SampleNoise
 from retwin.workers.threads import one_thread
 
@@ -39,9 +40,6 @@ MAX_ROUNDS = 12
 """Rounds of expectation-maximisation at most, with a search for missed segments in each."""
 TOLERANCE = 0.02
 """Relative change of all standard deviations below which they have converged."""
-DELAY_VARIANCE = 1 / 12
-"""Variance of the delays that the hyperprior expects, in samples squared: that of the time of an
-event within a sample."""
 SUSPECT = 2.5
 """Standard deviations of the prior beyond which an offset makes a segment suspect."""
 MOVING = 3.0
@@ -50,8 +48,6 @@ OUTLYING = 3.0
 """Noise scales beyond which a sample is an outlier."""
 OUTLYING_SHARE = 0.3
 """Share of outliers above which a segment is suspect."""
-FIRST_OFFSET = 0.05
-"""Standard deviation of an offset at first, in that of the commands' targets."""
 FIRST_ODDS = -4.0
 """Log odds at first that an actuator misses a segment: about one in fifty."""
 FIRST_JITTER = 1 / 35
@@ -96,34 +92,50 @@ def infer_commands(
     problem = replace(problem, own_delays=True)
     if not problem.valid.shape[1]:
         return _empty(problem), None
-    uncertain, problem = problem, problem.where_certain
-    start, spread = problem.zero, OffsetFeatures.of(problem).spread
-    problem = problem.with_missed(first_missed(problem, FIRST_OFFSET * spread, FIRST_ODDS))
+    features, start = OffsetFeatures.of(problem), problem.zero
+    replicates = features.replicates(problem)
+    uncertain = problem.counted_once(replicates)
+    problem = uncertain.where_certain
+    missed = first_missed(problem, FIRST_OFFSET * features.spread, FIRST_ODDS)
+    problem = problem.with_missed(missed)
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
-    first = Hyperparameters.of(problem, start)
+    first = Hyperparameters.of(problem, features, start)
+    # Replicates show no more of the variances than one does where the surrogate errs in all alike.
+    weight = torch.ones_like(start[:, :1])
+    if uncertain.common is not None:
+        weight = (1 / replicates).mean(dim=1, keepdim=True)
 
     def infer(found: MissedSearch, given: Hyperparameters) -> MissedSearch:
         white, prior, noise = given.whitened(problem), given.prior(problem), given.noise
         return searched(white, prior, noise, found.fit, partial(_suspects, white, prior, noise))
 
     def learn(found: MissedSearch, given: Hyperparameters) -> Hyperparameters:
-        return given.learned(problem.with_missed(found.fit.missed), found.fit.solution)
+        return given.learned(problem.with_missed(found.fit.missed), found.fit.solution, weight)
 
     fit = CommandFit.of_prior(problem, first.prior(problem), start)
-    found, learned = expectation_maximisation(
-        MissedSearch(fit, fit.missed, fit.evidence),
-        first,
-        infer=infer,
-        learn=learn,
-        rounds=MAX_ROUNDS,
-        converged=Hyperparameters.near,
-    )
+    found, learned = MissedSearch(fit, fit.missed, fit.evidence), first
+    for regression in (False, True):
+        if regression and not learned.explained(problem, found.fit, weight):
+            break
+        found, learned = expectation_maximisation(
+            found,
+            learned.with_regression(problem) if regression else learned,
+            infer=infer,
+            learn=learn,
+            rounds=MAX_ROUNDS,
+            converged=Hyperparameters.near,
+        )
+    certain = None
     if uncertain.common is not None:
+        certain = learned.linearised(problem, found.fit).weighted(weight)
         problem = uncertain
         found = infer(MissedSearch(fit, fit.missed, fit.evidence), learned)
-    problem = learned.whitened(problem).with_missed(found.fit.missed)
-    last = fitted(problem, learned.prior(problem), learned.noise, found.fit.x)
-    made = _discrepancy(problem, last.solution, found.probability, learned, identified_below)
+    likelihood = learned.linearised(problem, found.fit)
+    problem = problem.with_missed(found.fit.missed)
+    posterior = learned.hierarchy.integrated(learned.features.design(problem), likelihood, certain)
+    made = _discrepancy(
+        problem, likelihood.x, posterior, found.probability, learned, identified_below
+    )
     return made, learned
 
 
@@ -202,17 +214,19 @@ class Hyperparameters:
     noise: Noise
 
     @classmethod
-    def of(cls, problem: CommandProblem, start: Tensor) -> Hyperparameters:
+    def of(
+        cls, problem: CommandProblem, features: OffsetFeatures, start: Tensor
+    ) -> Hyperparameters:
         """Those before anything is inferred: wide, from first delays only."""
         moved = (problem.distance * (1 - problem.missed) > 0).any(dim=-1) & problem.valid
         shown = moved if moved.any() else problem.valid
         delay = problem.per_segment(start)[..., 0][shown]
-        jitter = 1.4826 * (delay - delay.median()).abs().median() + FIRST_JITTER * problem.width
+        deviation = 1.4826 * (delay - delay.median()).abs().median()
+        jitter = deviation + FIRST_JITTER * problem.width
         measured = problem.measured > 0
         # The median of nothing is NaN.
         length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
         scale = length.clamp_min(FLOOR).expand(2, 1)
-        features = OffsetFeatures.of(problem)
         offset = FIRST_OFFSET * features.spread
         design = features.design(problem)
         coefficients = torch.zeros(len(design.owner), dtype=torch.float64)
@@ -229,6 +243,25 @@ class Hyperparameters:
             Noise(scale, one),
         )
 
+    def explained(self, problem: CommandProblem, fit: CommandFit, weight: Tensor) -> bool:
+        """Whether a regression predicts offsets under new conditions better than a constant."""
+        likelihood = self.linearised(problem, fit).weighted(weight)
+        problem = problem.with_missed(fit.missed)
+        return regression_predicts_better(self.features, self.hierarchy, problem, likelihood)
+
+    def linearised(self, problem: CommandProblem, fit: CommandFit) -> Likelihood:
+        """The likelihood of x at the most probable one, if the segments of `fit` were missed."""
+        problem = self.whitened(problem.with_missed(fit.missed))
+        prior = self.prior(problem)
+        solution = fitted(problem, prior, self.noise, fit.x).solution
+        return Likelihood.of(solution, prior.gaussian)
+
+    def with_regression(self, problem: CommandProblem) -> Hyperparameters:
+        """The same to begin with, where offsets depend on direction, distance and pose."""
+        features = replace(self.features, regression=True)
+        adapted = self.hierarchy.adapted(features.design(problem))
+        return replace(self, features=features, hierarchy=adapted)
+
     def whitened(self, problem: CommandProblem) -> CommandProblem:
         """The problem in which the errors of a sample's outputs are independent."""
         return replace(problem, whitening=self.samples.whitening())
@@ -238,18 +271,20 @@ class Hyperparameters:
         gaussian = self.hierarchy.prior(self.features.design(problem))
         return LatentPrior(gaussian, self.odds.expand(problem.missed.shape))
 
-    def learned(self, problem: CommandProblem, solution: Solution) -> Hyperparameters:
-        """The most probable hyperparameters, given what was inferred and how certain that is."""
-        white, x = self.whitened(problem), solution.x
+    def learned(
+        self, problem: CommandProblem, solution: Solution, weight: Tensor
+    ) -> Hyperparameters:
+        """The most probable hyperparameters, given what was inferred and how certain that is.
+
+        Rows have the `weight` (n, 1) where variances are learned.
+        """
+        white, x, design = self.whitened(problem), solution.x, self.features.design(problem)
         samples = self.samples.learned(white, self.noise, x)
         white = replace(white, whitening=samples.whitening())
-        # Offsets are expected to be a share of what the actuators travel, the same for all.
-        spread, variance = self.features.spread.square(), self.hierarchy.variance
-        share, delay = (variance[1:-1] / spread).mean(), variance.new_tensor([DELAY_VARIANCE])
-        expected = torch.cat([delay, share * spread, delay])
+        likelihood = Likelihood.of(solution, self.hierarchy.prior(design)).weighted(weight)
         return Hyperparameters(
             self.features,
-            self.hierarchy.learned(self.features.design(problem), solution, expected),
+            self.hierarchy.learned(design, likelihood),
             _odds(problem),
             samples,
             self._noise(white, solution),
@@ -257,17 +292,23 @@ class Hyperparameters:
 
     def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
         """The noise of residuals, of which z* has fitted a part: few samples seem too exact."""
-        learned = white.learned_noise(self.noise, white.residual(solution.x), floor=FLOOR)
-        open_ = (self.prior(white).gaussian.precision * solution.covariance).sum()
-        fitted = solution.x.numel() - open_  # components of x that the outputs determine
+        residual = white.residual(solution.x)
+        learned = white.learned_noise(self.noise, residual, floor=FLOOR)
+        design = self.features.design(white)
+        likelihood = Likelihood.of(solution, self.hierarchy.prior(design))
+        covariance = self.hierarchy.posterior_covariance(design, likelihood)
+        fitted = (likelihood.curvature * covariance).sum()  # dimensions that outputs determine
         count = white.measured.sum() * white.observed.shape[2]
         left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
-        return replace(learned, scale=learned.scale / left.sqrt())
+        rest, path = learned.thinning
+        rest = rest.clamp_min(white.creep(learned, residual))
+        thinning = torch.stack([rest, path])
+        return replace(learned, scale=learned.scale / left.sqrt(), thinning=thinning)
 
     def near(self, other: Hyperparameters) -> bool:
         """Whether all standard deviations are about those of `other`."""
         pairs = (
-            (self.hierarchy.variance.sqrt(), other.hierarchy.variance.sqrt()),
+            (self.hierarchy.total().sqrt(), other.hierarchy.total().sqrt()),
             (self.noise.scale, other.noise.scale),
         )
         return all(bool(((a / b).log().abs() < TOLERANCE).all()) for a, b in pairs)
@@ -275,35 +316,40 @@ class Hyperparameters:
 
 def _discrepancy(
     problem: CommandProblem,
-    solution: Solution,
+    at: Tensor,
+    posterior: tuple[Tensor, Tensor],
     probability: Tensor,
     hyperparameters: Hyperparameters,
     identified_below: float,
 ) -> Discrepancy:
-    """z*, each segment's covariance, and which components the outputs identify."""
+    """z*, each segment's covariance, and which components the outputs identify.
+
+    The posterior, mean (n, P) and covariance (n, P, P) of x, is that of the problem linearised `at`
+    x (n, P).
+    """
     missed, segments = problem.missed, problem.missed.shape[1]
     hierarchy = hyperparameters.hierarchy
-    design = hyperparameters.features.design(problem)
     prior = hyperparameters.prior(problem).gaussian
     common = _common(problem)
+    found, covariance = posterior
     x, mean = (
-        (common @ problem.per_segment(each)[..., None])[..., 0] for each in (solution.x, prior.mean)
+        (common @ problem.per_segment(each)[..., None])[..., 0] for each in (found, prior.mean)
     )
     inner, wide = (
-        common @ blocks(each, segments) @ common.mT
-        for each in (hierarchy.posterior_covariance(design, solution), prior.covariance)
+        common @ blocks(each, segments) @ common.mT for each in (covariance, prior.covariance)
     )
+    x[..., 0].clamp_(*problem.delay_range)
     left, wide = inner.diagonal(dim1=-2, dim2=-1), wide.diagonal(dim1=-2, dim2=-1)
     severity = torch.where(problem.faulty, (x - mean)[..., 1:], 0.0)
     # Under a fault nothing was learned of the discrepancy: the prior stands.
     learned = torch.cat([problem.valid[..., None], problem.healthy], dim=-1).double()
     known = (left < identified_below * wide) & (learned > 0)
     # The common delay is bounded, whatever those of the actuators are.
-    delay = problem.per_segment(solution.x)[..., 0]
+    delay = problem.per_segment(at)[..., 0]
     bounded = at_bound(delay, problem.delay_range) & problem.valid
     known[..., 0] &= ~bounded
     known[..., 1:] &= missed < 0.5
-    own = torch.cat([wide[..., :1], hierarchy.variance[1:-1].expand_as(severity)], dim=-1)
+    own = torch.cat([wide[..., :1], hierarchy.total()[1:-1].expand_as(severity)], dim=-1)
     inner = inner * learned[..., None] * learned[..., None, :]
     inner = inner + torch.diag_embed(own * (1 - learned))
     covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))

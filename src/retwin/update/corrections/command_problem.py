@@ -33,6 +33,10 @@ COMMON_ERROR = 0.25
 """Variance of the error that all samples of a segment have in common, relative to that of one
 sample: what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
 resolution. Outputs cannot tell it from an offset, so it is no estimate."""
+SAMPLES_OF_HALVES = 4
+"""Samples at least of a rest whose halves are compared."""
+HYPERPRIOR_RESTS = 2.0
+"""Rests without any creep that are assumed besides those measured."""
 LARGE_ERROR = 2.0
 """Error of the surrogate, in that of half of the samples, beyond which nothing is learned from a
 segment but its own z."""
@@ -65,7 +69,8 @@ class CommandProblem:
         (n, S), the samples used of each trajectory, in order. A trajectory that has fewer than S
         repeats its last one.
     measured : Tensor
-        (n, S), 1 where `sample` was measured, 0 where it only fills the row.
+        (n, S), 1 where `sample` was measured, less where replicates err alike, 0 where it only
+        fills the row.
     group : Tensor
         (n, S) long, 1 where a segment may be in motion, where the surrogate is less accurate; 0 at
         rest.
@@ -181,6 +186,21 @@ class CommandProblem:
         }
         return replace(self, **parts)
 
+    def counted_once(self, replicates: Tensor) -> CommandProblem:
+        """The same where all replicates of a segment, (n, M) in number, err alike.
+
+        In motion they do, because paths between two levels are the same: all of them count as one.
+        The surrogate's error is the same, too.
+        """
+        own = self.inside
+        times = (own.mT @ replicates[..., None])[..., 0] + 1 - own.sum(dim=1)
+        moving, common = self.group == 1, self.common
+        if common is not None:
+            block = torch.where(moving, common.block, common.block * times)
+            common = CommonError(common.variance, block)
+        measured = torch.where(moving, self.measured / times, self.measured)
+        return replace(self, measured=measured, common=common)
+
     def with_missed(self, missed: Tensor) -> CommandProblem:
         """The same if the actuators missed other segments, (n, M, d_u)."""
         return replace(self, missed=missed)
@@ -262,11 +282,31 @@ class CommandProblem:
             floor=floor,
         )
 
+    def creep(self, noise: Noise, residual: Tensor) -> float:
+        """Samples of a rest per independent one if actuators creep.
+
+        A random walk ends as far from its mean as the means of its halves are apart: by a variance
+        that all samples have in common. The residual is (n, S, d_y); what independent errors
+        explain of the distance of these means is no creep.
+        """
+        rest = self.inside * (self.group == 0)[:, None]
+        count = rest.sum(dim=-1)
+        first = rest * (2 * rest.cumsum(dim=-1) <= count[..., None])
+        weights = noise.weights(self, residual)[:, None]
+        means, weight = [], []
+        for half in (first * weights, (rest - first) * weights):
+            weight.append(half.sum(dim=-1).clamp_min(1e-12))
+            means.append(half @ residual / weight[-1][..., None])
+        apart = ((means[0] - means[1]).square() / noise.scale[0].square()).mean(dim=-1)
+        excess = (apart - 1 / weight[0] - 1 / weight[1])[count >= SAMPLES_OF_HALVES]
+        common = COMMON_ERROR + max(0.0, float(excess.sum()) / (len(excess) + HYPERPRIOR_RESTS))
+        return 1 + common * float(count.sum()) / max(1.0, float(self.valid.sum()))
+
     @property
     def inside(self) -> Tensor:
         """(n, M, S), 1 where a measured sample belongs to a segment."""
         segment = within(self.sample, self.segments.start, np.ceil(self.segments.stop) - 1)
-        return segment.double() * self.measured[:, None]
+        return segment.double() * (self.measured > 0)[:, None]
 
     @property
     def levels(self) -> tuple[Tensor, Tensor]:
