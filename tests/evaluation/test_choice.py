@@ -163,7 +163,8 @@ def test_models_without_the_twin_are_compared_on_the_same_parts(tmp_path: Path) 
 
 def test_a_wrong_sign_is_mentioned() -> None:
     found = rt.fit(twin_of(sign=-1.0), records(0, slope=right), rt.Choice(candidates=("none",)))
-    assert any("check the sign" in each for each in found.remarks)
+    assert [each.kind for each in found.checked.findings] == ["sign"]
+    assert "check the sign of the gain" in fit_page(found, "model", title="heater")
 
 
 def test_a_missing_dead_time_is_mentioned_with_its_value() -> None:
