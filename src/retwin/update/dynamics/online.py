@@ -7,7 +7,8 @@ results are the same bytes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import ceil
 
@@ -19,7 +20,7 @@ from retwin.update.dynamics.filtering import STEP
 from retwin.update.dynamics.prediction import Narrowing
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["FilterState", "OnlineFilter"]
+__all__ = ["FilterState", "OnlineFilter", "moved"]
 
 GATE = 100.0
 """Number of standard deviations from which on an error is no news of the states: a sample of 1e300
@@ -64,6 +65,20 @@ class FilterState:
         return FilterState(*made)
 
 
+def directions(twin: DynamicsTwin) -> NDArray:
+    """Posterior deviations (r, q + d_x) of the parameters of a twin, without those of starts."""
+    moves = twin.factor.T.copy()
+    moves[:, -len(twin.process) :] = 0.0  # a running system may be in any state
+    return moves[moves.any(axis=1)]
+
+
+def moved(twin: DynamicsTwin, centre: Sequence[float]) -> DynamicsTwin:
+    """The twin of a system whose parameters are at `centre` (r,), or at () the most probable."""
+    if not len(centre):
+        return twin
+    return replace(twin, values=twin.values + np.asarray(centre) @ directions(twin))
+
+
 @dataclass(frozen=True, eq=False)
 class OnlineFilter:
     """The filter of a twin for systems that run.
@@ -87,9 +102,9 @@ class OnlineFilter:
     @cached_property
     def _moves(self) -> NDArray:
         """What is added to the values of the twin (1 + r, q + d_x); the first row is 0."""
-        moves = STEP * self.twin.factor.T * (self.effect > 0)
-        moves[:, -len(self.twin.process) :] = 0.0  # a running system may be in any state
-        return np.concatenate([np.zeros((1, moves.shape[1])), moves[moves.any(axis=1)]])
+        moves = STEP * directions(self.twin)
+        none = np.zeros((1, moves.shape[1]))
+        return np.concatenate([none, moves]) if self.effect else none
 
     def start(self, count: int) -> FilterState:
         """What is known of so many systems before their first sample, which may be anywhere."""
@@ -100,9 +115,10 @@ class OnlineFilter:
         earlier += ceil(max(delays) * twin.rate) + 1 if delays else 0
         commands = np.full((count, earlier, len(self.twin.inputs)), np.nan)
         states = theta[:, -spread.shape[1] :]
-        both = (np.repeat(each[:, None], moved, axis=1) for each in (states, spread))
+        both = [np.repeat(each[:, None], moved, axis=1) for each in (states, spread)]
         root = np.tile(self.effect * np.eye(moved - 1), (count, 1, 1))
-        return FilterState(*both, states, commands, np.zeros((count, moved - 1)), root)
+        centre = np.zeros((count, moved - 1))
+        return FilterState(both[0], both[1], states, commands, centre, root)
 
     def step(
         self,
@@ -137,7 +153,8 @@ class OnlineFilter:
             return self._passed(state, commands, measured, seen, learn)
         found = []
         for t in range(commands.shape[1]):  # a later command would change the spline
-            own = (each[:, t : t + 1] for each in (commands, measured, seen))
+            part = slice(t, t + 1)
+            own = commands[:, part], measured[:, part], seen[:, part]
             state, *more = self._passed(state, *own, learn)
             found.append(more)
         mean, covariance = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
@@ -179,8 +196,9 @@ class OnlineFilter:
         mean, covariance = means[:, 0], covariances[::moved, 1:]
         centre, root = state.centre, state.root
         if moved > 1:
-            slopes = np.moveaxis(means[:, 1:] - means[:, :1], 1, -1) / STEP
-            slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+            good = np.isfinite(means).all(axis=1, keepdims=True)
+            difference = np.where(good, means, 0.0)
+            slopes = np.moveaxis(difference[:, 1:] - difference[:, :1], 1, -1) / STEP
             narrowing = Narrowing(centre, root)
             used = seen & learn[:, None, None]
             mean, covariance = narrowing.run(mean, covariance, measured, used, slopes, GATE)

@@ -157,7 +157,8 @@ class Narrowing:
         mean, covariance = mean.copy(), covariance.copy()
         factor = root_of(covariance, seen)
         white = np.linalg.solve(factor, np.where(seen[..., None], slopes, 0.0))
-        errors = whitened(measured - mean, factor, seen)
+        white = np.where(np.isfinite(white), white, 0.0)
+        errors = whitened(measured - mean, factor, seen)  # NaN, where not finite, is no news
         for t in range(mean.shape[1]):
             mean[:, t] += (slopes[:, t] @ self.centre[..., None])[..., 0]
             h = slopes[:, t] @ self.root
