@@ -10,16 +10,19 @@ two cores.
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from record import record
 from sklearn.metrics import roc_auc_score
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import UNIT
-from retwin.diagnosis import Diagnosis, Estimate, fit_inversion
+from retwin.diagnosis import Diagnosis, Estimate, InversionDiagnoser, fit_inversion
 from retwin.scores.classification import score
 from retwin.twins.applied_faults import draw_faults
 from retwin.twins.faults import ActuatorBias, Stuck
@@ -45,6 +48,53 @@ def main() -> None:
     record("inversion", f"inversion of {9 * PER_CLASS} emulated trajectories per column", rows)
 
 
+@dataclass(frozen=True)
+class BothStuck:
+    """Two actuators whose responses are held from the same moment on."""
+
+    one: Stuck
+    other: int
+    label: str = "two stuck"
+
+    def drawn(self, rng: np.random.Generator, **about: Any) -> BothStuck:
+        """See `Fault.drawn`."""
+        return replace(self, one=self.one.drawn(rng, **about))
+
+    def command(self, commands: NDArray, segments: rt.Segments, rate: float) -> NDArray:
+        """See `Fault.command`."""
+        return commands
+
+    def response(self, response: NDArray, rate: float) -> NDArray:
+        """See `Fault.response`."""
+        held = self.one.response(response, rate)
+        return replace(self.one, actuator=self.other).response(held, rate)
+
+
+def several(
+    diagnoser: InversionDiagnoser, singles: rt.Trajectories, case: rt.Case, seed: int
+) -> dict[str, float]:
+    """How two stuck motors are told from single faults, and what that does to the latter."""
+    stuck = [fault for fault in case.faults.values() if isinstance(fault, Stuck)]
+    pairs = [BothStuck(a, b.actuator) for a, b in combinations(stuck, 2)]
+    drawn = [pair for pair in pairs for _ in range(PER_CLASS)]
+    commands = case.sampler.sample(len(drawn), rng=np.random.default_rng(seed + 7))
+    both = case.emulator.simulate(commands, faults=drawn, seed=seed + 7)
+    started = time.perf_counter()
+    one = diagnoser.diagnose(singles, max_faults=2)
+    taken = time.perf_counter() - started
+    two = diagnoser.diagnose(both, max_faults=2)
+    jammed = np.char.find(singles.labels.astype(str), "Stuck") >= 0
+    found = {}
+    for name, rows in (("one stuck", jammed), ("one fault or none", np.ones_like(jammed))):
+        scores = np.concatenate([one.several[rows], two.several])
+        truth = np.arange(len(scores)) >= rows.sum()
+        found[f"AUROC of two stuck against {name}"] = float(roc_auc_score(truth, scores))
+    found["two stuck called unknown"] = float(np.mean(two.labels == "unknown"))
+    found["single or none called several"] = float(np.mean(one.several > 0.5))
+    found["right single classes with pairs"] = float(np.mean(one.labels == singles.labels))
+    return found | {"pairs, ms per trajectory": 1000 * taken / len(singles)}
+
+
 def measured(
     ibg: rt.Surrogate, rg: rt.ResidualModel, healthy: rt.Trajectories, case: rt.Case, seed: int
 ) -> dict[str, float]:
@@ -67,6 +117,7 @@ def measured(
         **{name: scores[name] for name in shown},
         **severities(found, truth, faults, hidden["angles"][:, -1]),
         **left_out(found, truth),
+        **several(diagnoser, made.replace(labels=np.array(case.classes)[truth]), case, seed),
         "fit (s)": fitted,
         "diagnose, per trajectory (s)": seconds / len(made),
         "threads": float(torch.get_num_threads()),

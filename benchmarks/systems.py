@@ -27,9 +27,10 @@ from typing import Any
 import numpy as np
 from record import machine, rounded
 from systems import SYSTEMS, System
-from systems.methods import JOBS, METHODS, score
+from systems.methods import AHEAD, JOBS, METHODS, score
 
 from retwin.serialisation.files import write_atomically
+from retwin.update.forecast_errors import FEW
 from retwin.workers.pools import worker_pool
 
 HERE = Path(__file__).parent
@@ -139,7 +140,7 @@ def pooled(entries: list[dict[str, Any]]) -> dict[str, Any]:
     notes = dict.fromkeys(each.pop("note") for each in entries)
     values = {key: np.array([each[key] for each in entries], float) for key in entries[0]}
     seconds = float(values.pop("seconds").sum())
-    squares = {key: values.pop(key) for key in list(values) if key.startswith(("rmse", "ahead"))}
+    squares = {key: values.pop(key) for key in list(values) if key.startswith(("rmse", "ahead "))}
     roots = {key: float(np.sqrt(np.mean(each**2))) for key, each in squares.items()}
     means = {key: float(np.mean(each)) for key, each in values.items()}
     return {**roots, **means, "seconds": seconds, "note": "; ".join(notes)}
@@ -201,9 +202,34 @@ def table(rows: Rows, of: Callable[[Mapping[str, Any]], str]) -> str:
     )
 
 
+def band_table(rows: Rows) -> str:
+    """What bands of `rt.fit` hold, with its interval, and their width, by time ahead."""
+    lines = []
+    for row, found in rows.items():
+        scores = found["methods"].get("fit", {})
+        cells = []
+        for name in (*map(str, AHEAD), "free"):
+            held = scores.get(f"held {name}", float("nan"))
+            if scores.get(f"given {name}") == 0:
+                cells.append("none")
+            elif np.isnan(held):
+                cells.append("–")
+            else:
+                low, high = (scores[f"{end} {name}"] for end in ("low", "high"))
+                few = "" if scores[f"independent {name}"] >= FEW else " (few)"
+                given = scores[f"given {name}"]
+                part = "" if given > 0.995 else f", of {given:.0%}"
+                width = f"{scores[f'relative {name}']:.2g}"
+                cells.append(f"{held:.2f} ({low:.2f}–{high:.2f}), {width}{part}{few}")
+        lines.append(f"| {row} | " + " | ".join(cells) + " |")
+    heads = (*(f"{n} ahead" for n in AHEAD), "free")
+    return "\n".join(["| | " + " | ".join(heads) + " |", "|" + "---|" * (len(heads) + 1), *lines])
+
+
 def show(rows: Rows) -> None:
     for title, of in TABLES.items():
         print(f"\n{title}\n\n{table(rows, of)}")
+    print(f"\nBands of rt.fit\n\n{band_table(rows)}\n")
     for row, found in rows.items():
         notes = {name: each["note"] for name, each in found["methods"].items() if each["note"]}
         lines = [f"    {name}: {note}" for name, note in (notes | found["missing"]).items()]

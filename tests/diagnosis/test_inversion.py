@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from torch import Tensor
 
 import retwin as rt
 from retwin.diagnosis import Calibration, Diagnosis, InversionDiagnoser, conclude, fit_inversion
+from retwin.diagnosis.hypotheses import stuck_pairs
 from retwin.diagnosis.inversion import UNEXPLAINED
 from retwin.diagnosis.inversion_fitting import lower_bound
 from retwin.diagnosis.severity import draw_biases
@@ -354,6 +357,63 @@ def test_a_fault_that_is_left_out_is_unknown(
     parts = {"noise": inversion.noise, "bound": inversion.bound}
     others = InversionDiagnoser(inversion.surrogate, inversion.residual, faults, **parts)
     assert (others.diagnose(some).labels == "unknown").mean() >= 0.5
+
+
+@dataclass(frozen=True)
+class BothStuck:
+    """Two actuators whose responses are held from the same moment on."""
+
+    one: rt.Stuck
+    other: int
+    label: str = "two stuck"
+
+    def drawn(self, rng: np.random.Generator, **about: Any) -> BothStuck:
+        return replace(self, one=self.one.drawn(rng, **about))
+
+    def command(self, commands: np.ndarray, segments: rt.Segments, rate: float) -> np.ndarray:
+        return commands
+
+    def response(self, response: np.ndarray, rate: float) -> np.ndarray:
+        held = self.one.response(response, rate)
+        return replace(self.one, actuator=self.other).response(held, rate)
+
+
+@pytest.mark.slow
+def test_two_stuck_actuators_are_no_single_fault(
+    inversion: InversionDiagnoser, arm: tuple, case: rt.Case
+) -> None:
+    drawn = [BothStuck(rt.Stuck(i), j) for i, j in combinations(range(4), 2) for _ in range(3)]
+    commands = case.sampler.sample(len(drawn), rng=np.random.default_rng(9))
+    both = case.emulator.simulate(commands, faults=drawn, seed=9)
+    one, two = (inversion.diagnose(each, max_faults=2) for each in (arm[0], both))
+    scores = np.concatenate([one.several, two.several])
+    assert roc_auc_score(np.arange(len(scores)) >= len(one.several), scores) >= 0.95
+    assert (two.labels == "unknown").mean() >= 0.9
+    named = [
+        f"Motor_{each.one.actuator + 1}_Stuck and Motor_{each.other + 1}_Stuck" for each in drawn
+    ]
+    assert np.mean([name in why for name, why in zip(named, two.reason, strict=True)]) >= 0.9
+    # Single faults keep their answers.
+    assert (one.several > 0.5).sum() <= 1
+    alone = inversion.diagnose(arm[0])
+    assert (alone.several == 0).all()
+    np.testing.assert_allclose(one.probabilities, alone.probabilities, atol=1e-6)
+
+
+def test_pairs_are_those_of_actuators_that_are_stuck_from_the_same_moment() -> None:
+    faults = {"fine": None, "a": rt.Stuck(0), "b": rt.Stuck(1), "c": rt.Stuck(2, (0.0, 1.0))}
+    assert {name: pair.actuators for name, pair in stuck_pairs(faults).items()} == {
+        ("a", "b"): (0, 1)
+    }
+
+
+@pytest.mark.slow
+def test_pairs_are_refused_where_there_are_none(toy_diagnoser: InversionDiagnoser) -> None:
+    made = toy(2, "Healthy", 3)[0]
+    with pytest.raises(rt.InputError, match="max_faults: expected 1 for a diagnoser without two"):
+        toy_diagnoser.diagnose(made, max_faults=2)
+    with pytest.raises(rt.InputError, match="max_faults"):
+        conclude(toy_diagnoser, made, max_faults=3)
 
 
 @pytest.mark.slow

@@ -192,6 +192,25 @@ def test_a_saved_model_predicts_the_same(tmp_path: Path, method: str) -> None:
         np.testing.assert_allclose(one.deviation, other.deviation, rtol=1e-6)
 
 
+def test_no_band_is_given_where_commands_leave_the_range_of_the_calibration() -> None:
+    found = rt.fit(twin_of(), records(0, slope=right), rt.Choice(candidates=("parameters",)))
+    other = records(1, slope=right)
+    inside = predict_records(found.twin, other)
+    assert np.isfinite(inside.deviation).all()
+    wider = other.commands.copy()
+    wider[:, 200:230] *= 3
+    with pytest.warns(rt.update.OutsideTrainingWarning, match="1 of 1 records .* no band is given"):
+        outside = predict_records(found.twin, other.replace(commands=wider))
+    given = np.isfinite(outside.deviation[0, :, 0])
+    assert np.isfinite(outside.mean).all()
+    assert given[:200].all()
+    assert not given[200:230].any()
+    assert given[-200:].all()  # the heat of that time is lost
+    with pytest.warns(rt.update.OutsideTrainingWarning):
+        (row, *_) = rt.score_model(found.twin, other.replace(commands=wider))
+    assert np.isfinite([row.crps, row.coverage, row.width]).all()
+
+
 def test_a_twin_without_equations_and_case_is_given_when_it_is_loaded(tmp_path: Path) -> None:
     twin = rt.FunctionTwin(lambda u: np.cumsum(u, axis=1) * 0.1, INPUTS, OUTPUTS, 1.0)
     found = rt.fit(twin, records(0, slope=right), rt.Choice(candidates=("none",)))

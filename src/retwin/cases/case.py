@@ -51,7 +51,7 @@ class Body(Protocol):
         """Points (..., k, 3) in m along the chain, from its root to its tip."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Case(OfTwin):
     """One system: all that the rest of retwin must know of it.
 
@@ -65,8 +65,8 @@ class Case(OfTwin):
     title : str
         Its name on pages.
     faults : mapping of str to Fault or None
-        The fault of each class, None for the healthy one. The order is that of the classes in all
-        results.
+        The fault of each class, None for the healthy one, which is the only one by default. The
+        order is that of the classes in all results.
     twin : Twin
         The simulator to be updated; its channels and sample rate are those of the case.
     emulator : Twin or None
@@ -120,9 +120,9 @@ class Case(OfTwin):
 
     name: str
     title: str
-    faults: Mapping[str, Fault | None]
+    faults: Mapping[str, Fault | None] = field(default_factory=lambda: {HEALTHY: None})
     twin: Twin
-    emulator: Twin | None
+    emulator: Twin | None = None
     sampler: CommandSampler
     correction: Correction
     output_correction: Correction

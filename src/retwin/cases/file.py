@@ -147,7 +147,6 @@ def read_case(path: str | Path) -> Case:
             title=keys.title or keys.name,
             faults=faults,
             twin=twin,
-            emulator=None,
             sampler=sampler,
             correction=correction,
             output_correction=at_outputs,

@@ -81,12 +81,10 @@ def _check_size(found: Trajectories) -> None:
 def _constant(found: Trajectories) -> list[str]:
     """Channels that never change, among the commands and the outputs that were measured."""
     values = np.where(found.mask, found.observed, np.nan)
-    some = [(found.inputs.names[i], found.commands[..., i]) for i in range(len(found.inputs))] + [
-        (found.outputs.names[i], values[..., i]) for i in range(len(found.outputs))
-    ]
+    every = np.moveaxis(np.concatenate([found.commands, values], axis=2), 2, 0)
     return [
         name
-        for name, each in some
+        for name, each in zip((*found.inputs.names, *found.outputs.names), every, strict=True)
         if np.isfinite(each).any() and float(np.nanmax(each)) == float(np.nanmin(each))
     ]
 

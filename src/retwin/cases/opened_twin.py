@@ -9,9 +9,8 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from retwin import catalog, twins
+from retwin import cases, catalog, twins
 from retwin.cases.case import Case
-from retwin.cases.file import read_case
 from retwin.cases.named_twin import parametric_twin
 from retwin.checks import nothing, require
 from retwin.errors import InputError
@@ -62,6 +61,11 @@ class Known:
             return False
         inside = self.value is None or self.low <= self.value <= self.high
         return inside and isfinite(self.low) and isfinite(self.high)
+
+    @property
+    def parameter(self) -> Parameter:
+        """It as a free parameter, which it can be if it is `ranged`."""
+        return Parameter(self.name, self.unit, self.low, self.high, self.value)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +129,9 @@ def open_parametric(
         given twice, or its range does not contain its start.
 
     """
-    case = _case(name)
-    if case is not None:
+    toml, case = Path(name).suffix.lower() == ".toml", None
+    if toml or name in catalog.CASES:
+        case = cases.get(name)
         given = (*inputs, *outputs, *([f"{rate:g} Hz"] if rate is not None else []))
         expected = "none of them, since the case has its own"
         nothing("inputs, outputs, rate", given, expected, remedy="leave them out")
@@ -138,15 +143,6 @@ def open_parametric(
     known = tuple(_known(twin))
     made = _freed(twin, _chosen(known, free, name))
     return OpenedTwin(name, made, known, case, not (inputs or outputs or rate))
-
-
-def _case(name: str) -> Case | None:
-    """The case of that name; None if the name is that of a twin."""
-    if Path(name).suffix.lower() == ".toml":
-        return read_case(name)
-    if name not in catalog.CASES:
-        return None
-    return catalog.resolve(catalog.CASES[name].target)()
 
 
 def _known(twin: Twin) -> Iterator[Known]:
@@ -190,7 +186,7 @@ def _chosen(known: Sequence[Known], free: Sequence[str], name: str) -> list[Para
             else f"{name} names no parameters: give a function keyword arguments with numbers as "
             "defaults, or declare [parameters] in a case.toml",
         )
-        return [Parameter(e.name, e.unit, e.low, e.high, e.value) for e in ranged]  # type: ignore[arg-type]
+        return [each.parameter for each in ranged]
     made = [_parameter(text, by_name, known) for text in free]
     names = [each.name for each in made]
     twice = sorted({each for each in names if names.count(each) > 1})
@@ -216,7 +212,7 @@ def _parameter(text: str, by_name: dict[str, Known], known: Sequence[Known]) -> 
             got=repr(text),
             remedy=f"write --free {name or 'NAME'}=LOW:HIGH; {_listed(known)}",
         )
-        return Parameter(name, found.unit, found.low, found.high, found.value)  # type: ignore[arg-type]
+        return found.parameter
     try:
         low, high, *start = map(float, given.split(":"))
         if len(start) > 1 or not name:

@@ -85,23 +85,17 @@ def log_case(
         expected = "none of them, since the case has its own"
         nothing("inputs, outputs", (*inputs, *outputs), expected, remedy="leave them out")
         return cases.data_case(name)
-    if is_file:
-        twin = twins.get(name, inputs=inputs, outputs=outputs)
-        rate = 0.0
-    elif _takes_commands(name):
-        require(
-            inputs and outputs,
-            "--inputs, --outputs",
-            expected="the names of the channels, which a function does not have",
-            got=f"inputs {', '.join(inputs) or 'none'}, outputs {', '.join(outputs) or 'none'}",
-            remedy="name both, joined by commas",
-        )
-        # A function has no rate of its own, and its channels do not depend on it.
-        twin = twins.get(name, inputs=inputs, outputs=outputs, rate=1.0)
-        rate = 0.0
-    else:
-        twin = twins.get(name, inputs=inputs, outputs=outputs)
-        rate = twin.rate
+    # A function has no rate of its own, and its channels do not depend on it.
+    function = not is_file and _takes_commands(name)
+    require(
+        not function or (inputs and outputs),
+        "--inputs, --outputs",
+        expected="the names of the channels, which a function does not have",
+        got=f"inputs {', '.join(inputs) or 'none'}, outputs {', '.join(outputs) or 'none'}",
+        remedy="name both, joined by commas",
+    )
+    twin = twins.get(name, inputs=inputs, outputs=outputs, rate=1.0 if function else None)
+    rate = 0.0 if is_file or function else twin.rate
     made = TwinData(twin.inputs, twin.outputs, rate)
     return made if mapping is None else made.measured(read_mapping(mapping))
 

@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import re
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from retwin.checks import given
 from retwin.cli.options import CaseOption, Seed, argument, option
 from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, bar
-
-
-class Renderer(StrEnum):
-    """Renderers of the pictures."""
-
-    auto = "auto"
-    mujoco = "mujoco"
-    stick = "stick"
 
 
 def animate(
@@ -29,7 +20,9 @@ def animate(
     index: Annotated[int, option("N", "Which trajectory, by its place.", min=0)] = 0,
     fps: Annotated[float, option("HZ", "Pictures per second.")] = 25.0,
     size: Annotated[str, option("WxH", "Width and height in pixels.")] = "640x480",
-    renderer: Annotated[Renderer, option("", "What draws; auto: the best here.")] = Renderer.auto,
+    renderer: Annotated[
+        Literal["auto", "mujoco", "stick"], option("", "What draws; auto: the best here.")
+    ] = "auto",
     model: Annotated[
         Path | None, option("FOLDER", "A corrected twin, whose band is shown as well.")
     ] = None,
@@ -53,7 +46,7 @@ def animate(
             index=index if name is None else name,
             fps=fps,
             size=shape,
-            renderer=renderer.value,
+            renderer=renderer,
             updated=updated,
             seed=seed,
             progress=lambda share: show("draw", share),

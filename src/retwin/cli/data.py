@@ -223,10 +223,11 @@ def _channels_of(
 
 def _remarks(made: Proposal, tried: Parts | str) -> list[str]:
     """What the proposed mapping makes of a log, a sentence each."""
+    from retwin.report.labels import counted
+
     if isinstance(tried, str):
         return [f"The mapping makes no trajectories yet: {tried}"]
-    count = len(tried.blocks)
-    what = f"{count} {'trajectory' if count == 1 else 'trajectories'} at {tried.rate:g} Hz"
+    what = f"{counted(len(tried.blocks), 'trajectory')} at {tried.rate:g} Hz"
     return [f"{what}: {'; '.join(tried.notes(made.log))}", *tried.changes()]
 
 

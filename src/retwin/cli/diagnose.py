@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin import catalog
-from retwin.checks import require
 from retwin.cli.commands import Commands
 from retwin.cli.options import (
     CaseOption,
@@ -126,6 +125,9 @@ def predict(
     file: Measured,
     case: CaseOption = None,
     out: Probabilities = None,
+    max_faults: Annotated[
+        int, option("N", "2 also tries pairs of stuck actuators.", "--max-faults")
+    ] = 1,
     mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
@@ -133,16 +135,21 @@ def predict(
     """Diagnose trajectories, and score the diagnoses if the labels are known."""
     import retwin as rt
     from retwin.diagnosis import conclude
-    from retwin.evaluation.diagnosers import scored
+    from retwin.evaluation.diagnosers import check_probabilities, scored
 
     if out is not None:
         check_place(out)
     diagnoser = rt.load_diagnoser(saved(model))
     trajectories = read(file, data_case(case), max_bytes=max_bytes, mapping=mapping)
     with bar("diagnose") as show:
-        concluded = conclude(diagnoser, trajectories, progress=lambda share: show("faults", share))
+        concluded = conclude(
+            diagnoser,
+            trajectories,
+            max_faults=max_faults,
+            progress=lambda share: show("faults", share),
+        )
     probabilities, severities = concluded.probabilities, _severities(concluded)
-    _check_finite(trajectories, probabilities)
+    check_probabilities(trajectories, probabilities)
     labels = trajectories.labels.tolist()
     labelled = bool(trajectories.known_labels) and "" not in labels
     classes = diagnoser.classes
@@ -180,12 +187,14 @@ def predict(
 
 def _severities(concluded: Conclusion) -> list[dict[str, float | None]]:
     """What an inversion gives besides for the most probable class of each trajectory."""
-    from retwin.diagnosis import StateDiagnosis
+    from retwin.diagnosis import Diagnosis, StateDiagnosis
 
     found, count = concluded.found, len(concluded.labels)
     if found is None:
         return [{} for _ in range(count)]
     columns = {"unknown": found.unknown}
+    if isinstance(found, Diagnosis) and found.several.any():
+        columns["several"] = found.several
     if isinstance(found, StateDiagnosis):
         own = (np.arange(count), found.probabilities.argmax(axis=1))
         columns |= {"size": found.size.value[own], "onset in s": found.onset.value[own]}
@@ -233,20 +242,6 @@ def diagnoses(
             }
         )
     return made
-
-
-def _check_finite(trajectories: Trajectories, probabilities: NDArray) -> None:
-    """Raise InputError with the trajectories that have a probability that is not finite."""
-    bad = trajectories.ids[~np.isfinite(probabilities).all(axis=1)].tolist()
-    more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-    require(
-        not bad,
-        "probabilities",
-        expected="finite probabilities from the diagnoser",
-        got=f"NaN for {', '.join(bad[:5])}{more}",
-        remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser anew "
-        "if it gives NaN for others too",
-    )
 
 
 def write_probabilities(

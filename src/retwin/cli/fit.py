@@ -23,7 +23,7 @@ from retwin.serialisation.places import check_place
 if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.evaluation import Choice, Fitted
-    from retwin.evaluation.choice.stand_in import Simulating, StandIn
+    from retwin.evaluation.choice.surrogates import StandIn, SurrogateSettings
 
 data_option = partial(typer.Option, metavar="FILE", rich_help_panel="Data")
 model_option = partial(typer.Option, rich_help_panel="Model; by default the case's")
@@ -104,7 +104,7 @@ def fit(
     --network, --twin-data, --simulations or --refine.
     """
     import retwin as rt
-    from retwin.evaluation.choice.stand_in import Simulating
+    from retwin.evaluation.choice.surrogates import SurrogateSettings
     from retwin.update.residual.fitting import calibrating
 
     holds = ("model.json", "weights.safetensors", "surrogate", "residual", "choice.json")
@@ -135,7 +135,7 @@ def fit(
     equations = system.state_surrogate
     if dynamics and simulations is not None:
         equations = replace(equations, simulations=simulations)
-    how = Simulating(
+    how = SurrogateSettings(
         "on" if trained and surrogate == "auto" else surrogate,
         system.sampler,
         system.per_class,
@@ -161,7 +161,7 @@ def fit(
 def _carry_out(
     system: Case,
     measured: Trajectories,
-    how: Simulating,
+    how: SurrogateSettings,
     settings: Choice,
     name: str,
     out: Path,
@@ -172,7 +172,7 @@ def _carry_out(
     """Train a surrogate, compare, save, and compare with models without the twin."""
     import retwin as rt
     from retwin.evaluation.choice.fitting import with_yardstick
-    from retwin.evaluation.choice.stand_in import stand_in
+    from retwin.evaluation.choice.surrogates import stand_in
     from retwin.report.choice import fit_page
     from retwin.twins import keep_workers
 

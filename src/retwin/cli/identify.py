@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from retwin import catalog
-from retwin.checks import existing, one_of, positive, require
+from retwin.checks import existing, one_of, require
 from retwin.cli.completion import complete_twins
 from retwin.cli.options import (
     TWIN,
@@ -20,6 +21,7 @@ from retwin.cli.options import (
     argument,
     channel_names,
     option,
+    seconds_of,
 )
 from retwin.cli.terminal import answer, bar, command_given, note, table
 from retwin.serialisation.places import check_place
@@ -119,7 +121,9 @@ def identify(
     from retwin.update.identification import identify as run
 
     check_place(out, folder=True, holds=HOLDS)
-    settings, seconds = _method(method, loss, starts), _seconds(horizon)
+    settings = _method(method, loss, starts)
+    # Free is an infinite horizon, and none is one that is chosen.
+    ahead = {"horizon": seconds_of("--horizon", horizon) or inf} if horizon else {}
     columns = replace(_columns(column, time, transient), mapping=mapping)
     names = [channel_names(each) for each in (inputs, outputs)]
     for log in logs:
@@ -146,7 +150,7 @@ def identify(
             seed=seed,
             rate=sensor_rate,
             processes=processes,
-            **({} if seconds is None else {"horizon": seconds}),
+            **ahead,
             progress=lambda share: show("search, 2 of 3", share),
         )
         show("validate, 3 of 3", 0.0)
@@ -222,17 +226,6 @@ def _method(name: str, loss: str | None, starts: int | None) -> Any:
     return catalog.resolve(catalog.IDENTIFICATIONS[name].target)(**options)
 
 
-def _seconds(horizon: str) -> float | None:
-    """A horizon in s; None for one that is chosen."""
-    if not horizon or horizon == "free":
-        return float("inf") if horizon else None
-    try:
-        seconds = float(horizon.removesuffix("s"))
-    except ValueError:
-        seconds = float("nan")
-    return positive("--horizon", seconds, remedy="write free, or a time such as 5s")
-
-
 def _columns(column: list[str] | None, time: str | None, transient: float) -> Columns:
     """Which columns of a log are the channels of the twin."""
     from retwin.cases import Columns
@@ -256,12 +249,10 @@ def _columns(column: list[str] | None, time: str | None, transient: float) -> Co
 
 def _plan(opened: OpenedTwin, used: Any, method: str) -> str:
     """What will be done, in a line."""
-    count = len(used)
-    what = "trajectory" if count == 1 else "trajectories"
-    return (
-        f"{count} {what} of {used.steps / used.rate:g} s at {used.rate:g} Hz; {method} for "
-        f"{', '.join(opened.twin.names)}"
-    )
+    from retwin.report.labels import counted
+
+    what = f"{counted(len(used), 'trajectory')} of {used.steps / used.rate:g} s"
+    return f"{what} at {used.rate:g} Hz; {method} for {', '.join(opened.twin.names)}"
 
 
 def _print(found: Identification, values: dict[str, Any], *, as_json: bool) -> None:

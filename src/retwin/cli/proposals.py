@@ -67,17 +67,16 @@ def propose(
 
 def _ahead(made: Proposal) -> Any:
     """What is expected of further trajectories."""
-    rows = []
-    for chosen, random in zip(made.ahead, made.ahead_random, strict=True):
-        rows.append(
-            (
-                chosen.trajectories,
-                f"{chosen.excess[0]:+.1%}",
-                f"{random.excess[0]:+.1%} ({random.excess[1]:.1%} to {random.excess[2]:.1%})",
-                f"{chosen.recall[0]:.1%}",
-                f"{random.recall[0]:.1%} ({random.recall[1]:.1%} to {random.recall[2]:.1%})",
-            )
+    rows = [
+        (
+            chosen.trajectories,
+            f"{chosen.excess[0]:+.1%}",
+            f"{random.excess[0]:+.1%} ({random.excess[1]:.1%} to {random.excess[2]:.1%})",
+            f"{chosen.recall[0]:.1%}",
+            f"{random.recall[0]:.1%} ({random.recall[1]:.1%} to {random.recall[2]:.1%})",
         )
+        for chosen, random in zip(made.ahead, made.ahead_random, strict=True)
+    ]
     head = ("healthy", "band, chosen", "band, random", "recall, chosen", "recall, random")
     return table(head, rows)
 

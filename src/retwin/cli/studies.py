@@ -34,6 +34,8 @@ DEMO_MINUTES = 4
 """Minutes that a run of the demo takes at most on two cores, as measured."""
 VERDICTS = {"better": "better", "worse": "worse", "open": "undecided"}
 """Outcomes of a comparison in words."""
+COMPARED = {"a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict"}
+"""What is printed of a comparison as JSON."""
 data_option, compared_option = (
     partial(option, rich_help_panel=panel)
     for panel in (
@@ -231,12 +233,7 @@ def _summary(results: Results, page: Path) -> dict[str, Any]:
             for name, source in results.sources.items()
         },
         "comparisons": [
-            row.model_dump(
-                include={
-                    *("a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict")
-                }
-            )
-            | {"outcome": outcome_of(row)}
+            row.model_dump(include=COMPARED) | {"outcome": outcome_of(row)}
             for row in results.comparisons
         ],
         "report": str(page),

@@ -275,19 +275,13 @@ def _case(named: str | None, name: str, found: Twin) -> Case | None:
 def _faults(system: Case | None, fault: str) -> dict[str, Any]:
     from retwin.data.trajectories import HEALTHY
 
-    if fault == "none":
-        return {HEALTHY: None}
     classes = {} if system is None else dict(system.faults)
-    if classes and fault == "all":
-        return classes
-    if fault in classes:
-        return {fault: classes[fault]}
-    raise InputError(
-        "--fault",
-        expected=", ".join(["none", *(["all", *classes] if classes else [])]),
-        got=fault,
-        remedy="check the spelling" if classes else "give --case, which defines faults",
-    )
+    choices: dict[str, dict[str, Any]] = {"none": {HEALTHY: None}}
+    if classes:
+        choices |= {"all": classes, **{name: {name: each} for name, each in classes.items()}}
+    remedy = "check the spelling" if classes else "give --case, which defines faults"
+    require(fault in choices, "--fault", expected=", ".join(choices), got=fault, remedy=remedy)
+    return choices[fault]
 
 
 def _sampler(system: Case | None, found: Twin, duration: float | None) -> Any:

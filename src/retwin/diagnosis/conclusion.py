@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import one_of, require
 from retwin.data.measured import unmeasured_outputs
 from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.diagnoser import Diagnoser
@@ -43,18 +43,39 @@ class Conclusion:
 
 
 def conclude(
-    diagnoser: Diagnoser, trajectories: Trajectories, *, progress: Progress | None = None
+    diagnoser: Diagnoser,
+    trajectories: Trajectories,
+    *,
+    max_faults: int = 1,
+    progress: Progress | None = None,
 ) -> Conclusion:
     """Diagnose trajectories by a diagnoser of any kind.
+
+    Parameters
+    ----------
+    diagnoser : Diagnoser
+        An inversion also states why a trajectory is unknown.
+    trajectories : Trajectories
+        Commands and measured outputs.
+    max_faults : int, default 1
+        See `InversionDiagnoser.diagnose`; other diagnosers take 1 alone.
+    progress : callable, optional
+        Called with the share of the work that is done.
 
     Raises
     ------
     InputError
-        See `Diagnoser.predict_proba`.
+        See `Diagnoser.predict_proba`, or `max_faults` of a diagnoser that takes 1 alone.
 
     """
+    pairs = isinstance(diagnoser, InversionDiagnoser)
+    one_of("max_faults", max_faults, (1, 2) if pairs else (1,), remedy="invert in command space")
+    found: Diagnosis | StateDiagnosis
     if isinstance(diagnoser, InversionDiagnoser | StateInversionDiagnoser):
-        found = diagnoser.diagnose(trajectories, progress=progress)
+        if isinstance(diagnoser, InversionDiagnoser):
+            found = diagnoser.diagnose(trajectories, max_faults=max_faults, progress=progress)
+        else:
+            found = diagnoser.diagnose(trajectories, progress=progress)
         remark = str(getattr(diagnoser, "calibration", ""))
         return Conclusion(found.probabilities, found.labels, found.reason, remark, found)
     probabilities = np.asarray(diagnoser.predict_proba(trajectories))

@@ -1,14 +1,15 @@
 """The hypothesis of each class of faults: a prior of `CommandSpace`'s z, and who is held when.
 
 Healthy: z is distributed as the residual model has learned. Biased: one actuator's offsets have the
-fault's size on top of that. Stuck: one actuator's effective command stands still from an onset on.
-Rows are trajectories times classes, all solved together.
+fault's size on top of that. Stuck: the effective commands of one actuator, or of two, stand still
+from an onset on. Rows are trajectories times classes, all solved together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -43,6 +44,38 @@ def checked(faults: Mapping[str, Fault | None]) -> dict[str, Fault | None]:
     for fault in faults.values():
         _actuator_and_size(fault)
     return dict(faults)
+
+
+@dataclass(frozen=True)
+class StuckPair:
+    """Two actuators that are stuck from the same moment on.
+
+    Parameters
+    ----------
+    first : Stuck
+        One of them, and the onset of both.
+    other : int
+        The other actuator.
+
+    """
+
+    first: Stuck
+    other: int
+
+    @property
+    def actuators(self) -> tuple[int, int]:
+        """Both, counted from 0."""
+        return self.first.actuator, self.other
+
+
+def stuck_pairs(faults: Mapping[str, Fault | None]) -> dict[tuple[str, str], StuckPair]:
+    """The pairs of stuck actuators among some faults, by the names of their classes."""
+    stuck = [(name, fault) for name, fault in faults.items() if isinstance(fault, Stuck)]
+    return {
+        (one, two): StuckPair(fault, other.actuator)
+        for (one, fault), (two, other) in combinations(stuck, 2)
+        if fault.onset == other.onset and fault.actuator != other.actuator
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +126,9 @@ class Hypotheses:
     classes : int
         C.
     actuator : Tensor
-        (R,), which is faulty; 0 where none is.
+        (R,), which is faulty, of two the first; 0 where none is.
+    held_actuators : Tensor
+        (R, d_u) bool, those that are held from an onset on.
     size : Tensor
         (R, 2), smallest and largest size of a bias; 0 where there is none.
     onsets : Tensor
@@ -105,29 +140,30 @@ class Hypotheses:
     prior: LatentPrior
     classes: int
     actuator: Tensor
+    held_actuators: Tensor
     size: Tensor
     onsets: Tensor
 
     @classmethod
     def of(
         cls,
-        faults: Sequence[Fault | None],
+        faults: Sequence[Fault | StuckPair | None],
         residual: ResidualModel,
         context: Context,
         observed: Tensor,
         mask: Tensor,
     ) -> Hypotheses:
         """Every fault about every trajectory; `mask` is True where the sensor was sampled."""
-        n, steps, _ = context.commands.shape
+        n, steps, width = context.commands.shape
         rows = torch.arange(n).repeat_interleave(len(faults))
-        limits = [_limits(fault, steps, context.rate) for fault in faults]
-        actuator, size, onsets = (
+        limits = [_limits(fault, steps, width, context.rate) for fault in faults]
+        actuator, held, size, onsets = (
             torch.tensor(column).repeat(n, *[1] * np.ndim(column[0]))
             for column in zip(*limits, strict=True)
         )
         problem = command_problem(residual, context[rows.numpy()], observed[rows], mask[rows])
         prior = healthy_prior(residual, context)[rows]
-        made = cls(problem, prior, len(faults), actuator, size.double(), onsets)
+        made = cls(problem, prior, len(faults), actuator, held, size.double(), onsets)
         place, biased = made.offset_index, made.width > 0
         largest = torch.where(biased, made.size[:, 1], torch.inf)
         extra, limit = (
@@ -142,7 +178,9 @@ class Hypotheses:
 
     def __getitem__(self, rows: Tensor) -> Hypotheses:
         """Some of the rows."""
-        parts = (self.actuator[rows], self.size[rows], self.onsets[rows])
+        parts = (
+            each[rows] for each in (self.actuator, self.held_actuators, self.size, self.onsets)
+        )
         return Hypotheses(self.problem[rows], self.prior[rows], self.classes, *parts)
 
     @property
@@ -174,9 +212,8 @@ class Hypotheses:
 
     def held(self, onset: Tensor) -> Hypotheses:
         """The same with stuck actuators held from `onset` (R,) on."""
-        steps, width = self.problem.reference.shape[1:]
-        own = torch.nn.functional.one_hot(self.actuator, width).bool()
-        frozen = torch.where(own, onset[:, None], steps)
+        steps = self.problem.reference.shape[1]
+        frozen = torch.where(self.held_actuators, onset[:, None], steps)
         return replace(self, problem=self.problem.held_from(frozen))
 
 
@@ -199,8 +236,16 @@ def _actuator_and_size(fault: Fault | None) -> tuple[int, tuple[float, float]]:
 
 
 def _limits(
-    fault: Fault | None, steps: int, rate: float
-) -> tuple[int, tuple[float, float], tuple[int, int]]:
-    """Actuator, limits of the size of a bias, and of the sample at which it is stuck."""
-    onsets = fault.onset_range(steps, rate) if isinstance(fault, Stuck) else (steps, steps)
-    return *_actuator_and_size(fault), onsets
+    fault: Fault | StuckPair | None, steps: int, width: int, rate: float
+) -> tuple[int, list[bool], tuple[float, float], tuple[int, int]]:
+    """Actuator, which are held, limits of the size of a bias, and of the sample at which one is
+    stuck.
+    """
+    one = fault.first if isinstance(fault, StuckPair) else fault
+    actuator, size = _actuator_and_size(one)
+    held, onsets = [False] * width, (steps, steps)
+    if isinstance(one, Stuck):
+        onsets = one.onset_range(steps, rate)
+        for index in fault.actuators if isinstance(fault, StuckPair) else (actuator,):
+            held[index] = True
+    return actuator, held, size, onsets

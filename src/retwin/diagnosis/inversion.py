@@ -8,7 +8,7 @@ explain them best give the severity of the fault.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import NormalDist
@@ -16,13 +16,14 @@ from statistics import NormalDist
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import expit
+from scipy.special import expit, logsumexp
 from torch import Tensor
 
+from retwin.checks import one_of, require
 from retwin.data.measured import unmeasured_outputs
 from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.estimate import Calibration, Estimate
-from retwin.diagnosis.hypotheses import Hypotheses, checked
+from retwin.diagnosis.hypotheses import Hypotheses, StuckPair, checked, stuck_pairs
 from retwin.diagnosis.latent_prior import command_space
 from retwin.diagnosis.missed_segments import best_fit
 from retwin.diagnosis.onsets import Onsets
@@ -45,6 +46,8 @@ TRAJECTORIES_PER_BATCH = 16
 """Trajectories inverted together, which bounds memory."""
 UNEXPLAINED = "no class explains the outputs nearly as well as in calibration"
 """The reason for which a trajectory is unknown although it was measured."""
+PAIRS = 0.01
+"""Probability, beforehand, of two stuck actuators over that of a single fault or none."""
 COVERAGE = 0.9
 """Coverage of all intervals."""
 
@@ -81,6 +84,9 @@ class Diagnosis:
         first of them); NaN where there is no such segment, or none was executed.
     reason : NDArray
         (n,), why a trajectory is unknown; "" where it is not.
+    several : NDArray
+        (n,), the probability that two actuators are stuck, and not one of the classes true; 0 where
+        `max_faults` was 1.
 
     """
 
@@ -95,12 +101,13 @@ class Diagnosis:
     unknown: NDArray
     offset: NDArray
     reason: NDArray
+    several: NDArray
 
     @property
     def labels(self) -> NDArray:
         """The most probable class of each trajectory (n,), or "unknown"."""
         names = np.array(self.classes)[self.probabilities.argmax(axis=1)]
-        return np.where(self.unknown > 0.5, UNKNOWN, names)
+        return np.where(self.reason != "", UNKNOWN, names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,19 +231,35 @@ class InversionDiagnoser:
     @torch.no_grad()
     @one_thread()
     def diagnose(
-        self, trajectories: Trajectories, *, progress: Progress | None = None
+        self,
+        trajectories: Trajectories,
+        *,
+        max_faults: int = 1,
+        progress: Progress | None = None,
     ) -> Diagnosis:
         """Probabilities and severities of every class; all classes are equally probable beforehand.
+
+        Parameters
+        ----------
+        trajectories : Trajectories
+            Commands and measured outputs.
+        max_faults : int, default 1
+            2 also tries each pair of stuck actuators, which are stuck from the same moment on; a
+            trajectory that a pair explains better is "unknown", and the reason names the pair.
+        progress : callable, optional
+            Called with the share of the work that is done.
 
         Raises
         ------
         InputError
-            The channels or the sample rate are not those of the surrogate.
+            The channels or the sample rate are not those of the surrogate; 2 faults of a diagnoser
+            without two stuck actuators; another number.
 
         """
+        pairs = self._pairs(max_faults)
         given = DiagnosisInputs.of(self.surrogate, self.residual, trajectories)
         given = given.with_error(self.surrogate_variance)
-        faults = tuple(self.faults.values())
+        faults = (*self.faults.values(), *pairs.values())
         parts = []
         healthy = faults.index(None) if None in faults else -1
         for begin in range(0, len(trajectories), TRAJECTORIES_PER_BATCH):
@@ -249,6 +272,11 @@ class InversionDiagnoser:
                 progress(min(1.0, (begin + TRAJECTORIES_PER_BATCH) / len(trajectories)))
         evidence, explained, level, onset, bias, offset = (
             np.concatenate(each) for each in zip(*parts, strict=True)
+        )
+        count = len(self.classes)
+        each, named = _several(evidence, count, list(pairs))
+        evidence, explained, level, onset, bias = (
+            found[:, :count] for found in (evidence, explained, level, onset, bias)
         )
         share = np.exp(evidence - evidence.max(axis=1, keepdims=True))
         missing = unmeasured_outputs(trajectories, self.calibration.outputs)
@@ -268,8 +296,24 @@ class InversionDiagnoser:
             outside_training(self.surrogate, trajectories),
             unknown,
             offset,
-            np.where((missing == "") & (unknown > 0.5), UNEXPLAINED, missing),
+            np.select(
+                [missing != "", each > 0.5, unknown > 0.5], [missing, named, UNEXPLAINED], ""
+            ),
+            each,
         )
+
+    def _pairs(self, max_faults: int) -> dict[tuple[str, str], StuckPair]:
+        """The pairs of stuck actuators that are tried, by the names of their classes."""
+        one_of("max_faults", max_faults, (1, 2))
+        pairs = stuck_pairs(self.faults) if max_faults > 1 else {}
+        require(
+            max_faults == 1 or len(pairs) > 0,
+            "max_faults",
+            expected="1 for a diagnoser without two actuators that can be stuck",
+            got=max_faults,
+            remedy="add their classes to its faults",
+        )
+        return pairs
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with `surrogate` and `residual` inside, or nothing."""
@@ -314,6 +358,22 @@ class InversionDiagnoser:
 
 FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 """The faults that can be inverted, and that a model folder may name."""
+
+
+def _several(
+    evidence: NDArray, classes: int, pairs: Sequence[tuple[str, str]]
+) -> tuple[NDArray, NDArray]:
+    """The probability (n,) that a pair is true, and a sentence with the most probable pair.
+
+    `evidence` (n, C + pairs); beforehand all pairs are `PAIRS` as probable as all C classes.
+    """
+    if not pairs:
+        return np.zeros(len(evidence)), np.full(len(evidence), "", dtype=object)
+    one = logsumexp(evidence[:, :classes], axis=1) - np.log(classes)
+    two = logsumexp(evidence[:, classes:], axis=1) - np.log(len(pairs))
+    best = evidence[:, classes:].argmax(axis=1)
+    text = [f"more than one fault: {' and '.join(pairs[i])} explain the outputs best" for i in best]
+    return expit(two - one + np.log(PAIRS)), np.array(text, dtype=object)
 
 
 def _offsets(rows: Hypotheses, found: Inversion, classes: int, healthy: int) -> NDArray:

@@ -10,7 +10,8 @@ from retwin._lazy import homes, names
 
 _HOME = homes(
     {
-        "choice": "CandidateScore Choice Fitted ModelScore fit predict_records score_model",
+        "choice": "CandidateScore Choice Fitted ModelScore StandIn SurrogateSettings fit "
+        "predict_records score_model stand_in",
         "diagnosers": "evaluate",
         "experiments.propose": "Proposal next_experiments",
         "fidelity": "Fidelity Figure Overlay Simulation measure_fidelity measure_widening "

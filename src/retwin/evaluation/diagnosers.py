@@ -49,33 +49,24 @@ def scored(test: Trajectories, probabilities: NDArray, classes: Sequence[str]) -
 
 
 def finite_probabilities(diagnoser: Diagnoser, trajectories: Trajectories) -> NDArray:
-    """Class probabilities that can be scored.
-
-    Parameters
-    ----------
-    diagnoser : Diagnoser
-        It predicts without the labels.
-    trajectories : Trajectories
-        n trajectories.
-
-    Returns
-    -------
-    NDArray
-        Probabilities (n, classes), all finite.
-
-    Raises
-    ------
-    InputError
-        If a probability is not finite, because its largest would be taken for a class.
-
-    """
+    """Probabilities (n, classes) of a diagnoser that can be scored; see `check_probabilities`."""
     probabilities = diagnoser.predict_proba(trajectories)
+    check_probabilities(trajectories, probabilities)
+    return probabilities
+
+
+def check_probabilities(trajectories: Trajectories, probabilities: NDArray) -> None:
+    """Check that probabilities (n, classes) of trajectories can be scored.
+
+    Raises InputError if one is not finite, because its largest would be taken for a class.
+    """
     failed = trajectories.ids[~np.isfinite(probabilities).all(axis=1)].tolist()
+    more = f" and {len(failed) - 5} more" if len(failed) > 5 else ""
     require(
         not failed,
         "probabilities",
         expected="finite probabilities from the diagnoser",
-        got=f"{len(failed)} trajectories with others, such as {', '.join(failed[:5])}",
-        remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser anew",
+        got=f"NaN for {', '.join(failed[:5])}{more}",
+        remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser anew "
+        "if it gives NaN for others too",
     )
-    return probabilities

@@ -138,8 +138,6 @@ def reason(comparison: Comparison) -> str:
 
 WIDE, NEAR = 0.01, 0.001
 """The width of an interval beyond which shares so near to 0 and 1 need no more digits."""
-SMALL = 0.1
-"""Values below this are shown with more decimals."""
 
 
 def number(value: float | None, digits: int | None = None) -> str:
@@ -152,16 +150,18 @@ def number(value: float | None, digits: int | None = None) -> str:
 
 def decimals(*values: float) -> int:
     """Three decimals, and more where the largest value would have less than three digits left."""
-    largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
-    if largest == 0 or largest >= SMALL:
-        return 3
-    return 2 - math.floor(math.log10(largest))
+    return max(3, _digits(values))
 
 
 def places(values: Iterable[float]) -> int:
     """Decimals that leave three significant digits of the largest value, nine decimals at most."""
+    return max(0, min(9, _digits(values)))
+
+
+def _digits(values: Iterable[float]) -> int:
+    """Decimals of the third significant digit of the largest value; three of 0."""
     largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
-    return 3 if largest == 0 else max(0, min(9, 2 - math.floor(math.log10(largest))))
+    return 2 - math.floor(math.log10(largest)) if largest else 3
 
 
 def significant(value: float, like: float | None = None) -> str:

@@ -1,15 +1,15 @@
-"""Panels of residuals: their correlation with themselves and with commands, and their spectra."""
+"""Figures of residuals: their correlation with themselves and with commands, and their spectra."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.report.figure import Axis, Band, Key, Line, Mark, Panel, Row
+from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
 from retwin.scores.residuals import (
     autocorrelation,
     cross_correlation,
@@ -56,7 +56,22 @@ def line(x: NDArray, y: NDArray, key: Key) -> Line:
     return Line(x, y, key.text, key.colour, key.mark, 1.6)
 
 
-def autocorrelation_panel(errors: Errors, rate: float) -> Panel:
+def residual_figures(
+    errors: Sequence[Errors], commands: Sequence[ChannelRecords], keys: Sequence[Key], rate: float
+) -> list[Figure]:
+    """Correlations of errors with themselves and with commands, and spectra; `keys` of models."""
+    crossed = [_cross_correlation_panel(each, of, rate) for each in errors for of in commands]
+    limits = [Key(f"95 % limits, {key.text}", key.colour, "bar") for key in keys]
+    densities = [panel for each in errors if (panel := _spectrum_panel(each, rate))]
+    own = [_autocorrelation_panel(each, rate) for each in errors]
+    return [
+        Figure("autocorrelation", own, [*keys, WHITE]),
+        Figure("crosscorrelation", crossed, [*keys, *limits]),
+        Figure("spectra", densities, [Key("measured output", "ink"), *keys]),
+    ]
+
+
+def _autocorrelation_panel(errors: Errors, rate: float) -> Panel:
     """The autocorrelation of each error by lag."""
     found = {k: autocorrelation(e, errors.lags).thinned(POINTS) for k, e in errors.by_key.items()}
     first = next(iter(found.values()))
@@ -72,7 +87,7 @@ def autocorrelation_panel(errors: Errors, rate: float) -> Panel:
     )
 
 
-def cross_correlation_panel(errors: Errors, command: ChannelRecords, rate: float) -> Panel:
+def _cross_correlation_panel(errors: Errors, command: ChannelRecords, rate: float) -> Panel:
     """The correlation of each error with a command that is earlier."""
     marks: list[Mark] = []
     largest = 0.0
@@ -93,7 +108,7 @@ def cross_correlation_panel(errors: Errors, command: ChannelRecords, rate: float
     )
 
 
-def spectrum_panel(errors: Errors, rate: float) -> Panel | None:
+def _spectrum_panel(errors: Errors, rate: float) -> Panel | None:
     """The spectra of the output and of each error; None where all parts have a hole."""
     output = errors.output
     frequencies, (signal, *others) = spectra([output.values, *errors.by_key.values()], rate)

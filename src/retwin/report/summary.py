@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -96,9 +97,10 @@ def learned(study: Study) -> Table | None:
     range of single segments.
     """
     rows: dict[str, _Row] = {}
-    for name, row in (*_segment_rows(study), *_held_out_rows(study)):
+    for component in (*_segment_values(study), *_held_out_values(study)):
+        name, row = component[0], _row(*component)
         # Of a component that both have, the one that more segments identify.
-        if name not in rows or row.count > rows[name].count:
+        if row and (name not in rows or row.count > rows[name].count):
             rows[name] = row
     heads = ["Quantity", "Mean", "95 % interval", "Range of 90 % of the segments"]
     heads += ["Generated mean", "Segments"]
@@ -114,30 +116,31 @@ class _Row:
     count: int
 
 
-def _segment_rows(study: Study) -> list[tuple[str, _Row]]:
+Values = Iterator[tuple[str, str, NDArray, float | None]]
+"""Components of z: name, unit, values (trajectories, segments), NaN where they are not identified,
+and the mean of those that the updated twin generates, if it is known."""
+
+
+def _segment_values(study: Study) -> Values:
     """Delays, offsets and missed segments, inferred from every healthy test trajectory."""
     overlay, values = study.results.overlay, study.arrays.get("portrait/z")
     if overlay is None or values is None or not study.healthy.any():
-        return []
+        return
     units = quantities(overlay.latent_units, len(overlay.latents))
-    rows = []
     for column, (name, (factor, unit)) in enumerate(zip(overlay.latents, units, strict=True)):
-        row = _row(name, unit, factor * values[study.healthy, :, column].astype(float))
-        rows += [(name, row)] if row else []
-    return rows
+        yield name, unit, factor * values[study.healthy, :, column].astype(float), None
 
 
-def _held_out_rows(study: Study) -> list[tuple[str, _Row]]:
+def _held_out_values(study: Study) -> Values:
     """Delay, and noise at rest of each output, measured and generated.
 
     Offsets too, where no others are known from every test trajectory.
     """
     pair = headline(study.results)
     if pair is None:
-        return []
+        return
     owner = study.arrays.get(f"z/{pair[0]}/trajectory")
     kinds = ("noise_", "delay", *([] if study.results.overlay else ["offset_"]))
-    rows = []
     for each in study.components(pair[0]):
         if not each.name.startswith(kinds):
             continue
@@ -146,13 +149,11 @@ def _held_out_rows(study: Study) -> list[tuple[str, _Row]]:
         size = max(map(len, groups))
         padded = [np.pad(part, (0, size - len(part)), constant_values=np.nan) for part in groups]
         mean = float(drawn.astype(float).mean()) if len(drawn) else None
-        row = _row(each.name, each.unit, np.array(padded), mean)
-        rows += [(each.name, row)] if row else []
-    return rows
+        yield each.name, each.unit, np.array(padded), mean
 
 
-def _row(name: str, unit: str, values: NDArray, generated: float | None = None) -> _Row | None:
-    """A row from values (trajectories, segments), NaN where they are not identified."""
+def _row(name: str, unit: str, values: NDArray, generated: float | None) -> _Row | None:
+    """A row from `Values`; None where nothing is identified."""
     values = values[np.isfinite(values).any(axis=1)]
     if not len(values):
         return None

@@ -23,7 +23,7 @@ from retwin.catalog import CANDIDATES, NEEDS, SOURCES, resolve
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis import FittedDiagnoser
 from retwin.evaluation.choice import Choice, fit
-from retwin.evaluation.choice.stand_in import Simulating, stand_in
+from retwin.evaluation.choice.surrogates import SurrogateSettings, stand_in
 from retwin.evaluation.diagnosers import finite_probabilities
 from retwin.evaluation.fidelity import (
     measure_fidelity,
@@ -247,7 +247,7 @@ class Work:
             case, seed, progress = self.case, trial.seed("update"), trial.progress
             equations = case.state_surrogate if trial.job.name == "dynamics" else None
             simulated = case.sampler, case.per_class, case.network, case.training
-            how = Simulating("auto", *simulated, equations=equations)
+            how = SurrogateSettings("auto", *simulated, equations=equations)
             twin = case.parametric or case.twin
             base = stand_in(twin, trial.healthy, how, seed=seed, progress=progress).twin
             if trial.job.name == "fit":

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import ndtri, stdtrit
 
 from retwin.checks import require
 
@@ -24,6 +24,8 @@ USUAL = float(ndtri((1 + LEVEL) / 2))
 """Their half width in standard deviations of a Gaussian distribution."""
 FEW = 5
 """Independent samples below which no band is promised: the 90 % quantile of four is none."""
+BEYOND = 0.05
+"""Share of the width of its range by which a value may leave it, as noise makes it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,15 @@ class ForecastErrors:
         the errors of samples that were left out of the fit.
     independent : NDArray
         (L, d_y), how many independent samples these are worth.
+    memory : float
+        Time in s after which the system forgets: five correlation times of the errors of free
+        simulation.
+    low, high : NDArray
+        (d_u + d_y,), least and greatest value of the commands, and then of the outputs, in the
+        calibration.
+    beyond : float
+        How far a value may leave that range, in widths of it: as far as the parts that were left
+        out left the range of the others while the bands held.
 
     """
 
@@ -48,6 +59,10 @@ class ForecastErrors:
     persistence: NDArray
     deviation: NDArray
     independent: NDArray
+    memory: float
+    low: NDArray
+    high: NDArray
+    beyond: float
 
     def at(self, lead: float) -> tuple[NDArray, NDArray]:
         """Persistence and deviation (d_y,) of any time ahead in s, interpolated over its log."""
@@ -64,12 +79,29 @@ class ForecastErrors:
         """Whether errors were enough to promise bands of free simulation."""
         return bool(self.independent[-1].min() >= FEW)
 
+    def outside(self, values: NDArray, rate: float) -> NDArray:
+        """Samples (n, T) at which a value is outside of its range, or was so not long ago.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n, T, d_u + d_y)
+            Commands and predicted outputs, which may be NaN.
+        rate : float
+            Sample rate in Hz.
+
+        """
+        steps = np.arange(values.shape[1])
+        far = range_excess(values, self.low, self.high) > self.beyond
+        last = np.maximum.accumulate(np.where(far, steps, -np.inf), axis=1)
+        return np.asarray(steps - last <= self.memory * rate)
+
     @property
     def values(self) -> dict[str, Any]:
         """As JSON values; an infinite time is null."""
         leads = [each if np.isfinite(each) else None for each in self.leads.tolist()]
-        names = ("persistence", "deviation", "independent")
-        return {"leads": leads} | {name: getattr(self, name).tolist() for name in names}
+        names = ("persistence", "deviation", "independent", "low", "high")
+        arrays = {name: getattr(self, name).tolist() for name in names}
+        return {"leads": leads, **arrays, "memory": self.memory, "beyond": self.beyond}
 
     @classmethod
     def of(cls, values: Mapping[str, Any] | None) -> ForecastErrors | None:
@@ -82,27 +114,57 @@ class ForecastErrors:
         leads = np.array([np.inf if each is None else each for each in values["leads"]], float)
         names = ("persistence", "deviation", "independent")
         arrays = [np.array(values[name], dtype=float) for name in names]
+        low, high = (np.array(values[name], dtype=float) for name in ("low", "high"))
         require(
             all(each.ndim == 2 and len(each) == len(leads) for each in arrays)
-            and all(np.isfinite(each).all() and (each >= 0).all() for each in arrays),
+            and all(np.isfinite(each).all() and (each >= 0).all() for each in arrays)
+            and low.shape == high.shape
+            and bool((low <= high).all()),
             "forecast",
-            expected="one finite row for each time ahead",
-            got=[each.shape for each in arrays],
+            expected="one finite row for each time ahead, and ranges from low to high",
+            got=[each.shape for each in (*arrays, low, high)],
             remedy="save the model again",
         )
-        return cls(leads, *arrays)
+        memory, beyond = float(values["memory"]), float(values["beyond"])
+        persistence, deviation, independent = arrays
+        return cls(leads, persistence, deviation, independent, memory, low, high, beyond)
 
 
-def conformal_deviation(errors: NDArray, independent: float) -> float:
+def value_range(values: NDArray) -> tuple[NDArray, NDArray]:
+    """Least and greatest of values (n, T, d), each (d,); 0 where all are NaN."""
+    seen = np.isfinite(values)
+    low = np.where(seen, values, np.inf).min(axis=(0, 1), initial=np.inf)
+    high = np.where(seen, values, -np.inf).max(axis=(0, 1), initial=-np.inf)
+    known = low <= high
+    return np.where(known, low, 0.0), np.where(known, high, 0.0)
+
+
+def range_excess(values: NDArray, low: NDArray, high: NDArray) -> NDArray:
+    """How far each sample (n, T) of values (n, T, d) leaves a range (d,), in widths of that.
+
+    NaN counts as inside; the width of a constant is its size, or 1 if that is 0.
+    """
+    size = np.where(high != 0, np.abs(high), 1.0)
+    width = np.where(high > low, high - low, size)
+    distance = np.nan_to_num(np.maximum(values - high, low - values) / width)
+    furthest: NDArray = distance.max(axis=2, initial=0.0)
+    return furthest
+
+
+def predictive_deviation(errors: NDArray, independent: float) -> float:
     """The deviation whose central 90 % interval holds 90 % of further errors.
+
+    It is the 90 % quantile of the errors' sizes; as the scale of few independent errors is
+    uncertain, it is widened by the ratio of the quantiles of Student's t distribution, with so
+    many degrees of freedom, and the Gaussian one.
 
     Parameters
     ----------
     errors : NDArray
         (K,), of samples that were left out of the fit.
     independent : float
-        How many independent ones they are worth; the fewer, the higher the quantile.
+        How many independent ones they are worth.
 
     """
-    level = min(1.0, LEVEL * (1 + 1 / max(independent, 1.0)))
-    return float(np.quantile(np.abs(errors), level) / USUAL)
+    student = stdtrit(max(independent, 1.0), (1 + LEVEL) / 2)
+    return float(np.quantile(np.abs(errors), LEVEL) * student / USUAL**2)

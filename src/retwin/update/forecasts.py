@@ -17,7 +17,14 @@ from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive
 from retwin.update.dynamics.estimation import correlation_time
 from retwin.update.dynamics.twin import DynamicsTwin
-from retwin.update.forecast_errors import ForecastErrors, conformal_deviation
+from retwin.update.forecast_errors import (
+    BEYOND,
+    LEVEL,
+    USUAL,
+    ForecastErrors,
+    predictive_deviation,
+    value_range,
+)
 
 DRAWS = 100
 """Simulations of a trajectory whose mean and deviation stand for a distribution."""
@@ -25,6 +32,8 @@ ORIGINS = 2000
 """Samples from which predictions start, at most, of all trajectories together."""
 LEADS = (1, 3, 10, 30, 100)
 """Samples ahead at which errors are calibrated."""
+FORGOTTEN = 5.0
+"""Correlation times of errors after which one of them is forgotten."""
 
 
 def free_moments(twin: Twin, commands: NDArray, *, seed: int = 0) -> tuple[NDArray, NDArray]:
@@ -131,42 +140,110 @@ def _from_states(twin: DynamicsTwin, record: Trajectories, leads: Sequence[int])
     return made
 
 
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Predictions of a part of some records by a model that was not fitted to it.
+
+    Attributes
+    ----------
+    ahead : Forecasts
+        Predictions some samples ahead of the last measurement.
+    free : NDArray
+        (r, T, d_y), means of the free simulation.
+    record : Trajectories
+        The r records of which something was left out.
+    held : NDArray
+        (r, T) bool, the samples that were left out.
+    excess : float
+        How far their values leave the range of those that the model was fitted to, in widths.
+    edge : bool
+        Whether they are the largest commands and outputs of all.
+
+    """
+
+    ahead: Forecasts
+    free: NDArray
+    record: Trajectories
+    held: NDArray
+    excess: float
+    edge: bool
+
+
+def values_of(records: Trajectories) -> NDArray:
+    """Commands and measured outputs (n, T, d_u + d_y); NaN where nothing was measured."""
+    measured = np.where(records.mask, records.observed, np.nan).astype(np.float64)
+    commands = np.where(records.mask.any(axis=2, keepdims=True), records.commands, np.nan)
+    return np.concatenate([commands.astype(np.float64), measured], axis=2)
+
+
 def calibrate_forecasts(
-    found: Sequence[tuple[Forecasts, NDArray, Trajectories, NDArray]], leads: Sequence[int]
+    records: Trajectories, found: Sequence[LeftOut], leads: Sequence[int]
 ) -> ForecastErrors:
     """The errors of predictions, from parts of records that the models were not fitted to.
 
+    Deviations are those of parts in time. Where the bands of free simulation hold the largest
+    commands and outputs too, they are given as far beyond the range of the calibration as these
+    are beyond that of the others.
+
     Parameters
     ----------
-    found : sequence of (Forecasts, NDArray, Trajectories, NDArray)
-        Of each model: predictions, means (n, T, d_y) of the free simulation, the record, and which
-        of its samples (n, T) it was not fitted to.
+    records : Trajectories
+        All of the calibration.
+    found : sequence of LeftOut
+        The parts.
     leads : sequence of int
         Samples ahead of the predictions.
 
     """
-    record, rows = found[0][2], []
+    rows = []
     for i in range(len(leads) + 1):
-        pairs = []
-        for made, free, each, part in found:
-            mean, last = (free, 0.0 * free) if i == len(leads) else (made.mean[i], made.last[i])
-            seen = each.mask & part[..., None] & np.isfinite(mean)
-            pairs.append((np.where(seen, each.observed - mean, np.nan), np.where(seen, last, 0.0)))
-        rows.append([_calibrated(pairs, channel) for channel in range(len(record.outputs))])
-    persistence, deviation, independent = np.moveaxis(np.array(rows), 2, 0)
-    times = np.append(np.array(leads) / record.rate, np.inf)
-    return ForecastErrors(times, persistence, deviation, independent)
+        pairs = [_errors(each, i) for each in found if not each.edge]
+        rows.append([_calibrated(pairs, channel) for channel in range(len(records.outputs))])
+    persistence, deviation, independent, correlation = np.moveaxis(np.array(rows), 2, 0)
+    memory = float(FORGOTTEN * correlation[-1].max() / records.rate)
+    beyond = max([BEYOND, *(each.excess for each in found if not each.edge)])
+    for each in found:
+        if each.edge and _hold(_errors(each, len(leads))[0], deviation[-1]):
+            beyond = max(beyond, each.excess)
+    times = np.append(np.array(leads) / records.rate, np.inf)
+    low, high = value_range(values_of(records))
+    return ForecastErrors(times, persistence, deviation, independent, memory, low, high, beyond)
+
+
+def _errors(part: LeftOut, i: int) -> tuple[NDArray, NDArray]:
+    """Errors (r, T, d_y) of what was left out, NaN elsewhere, and the last errors before.
+
+    `i` counts the times ahead, and then free simulation.
+    """
+    mean, last = part.free, 0.0 * part.free
+    if i < len(part.ahead.mean):
+        mean, last = part.ahead.mean[i], part.ahead.last[i]
+    seen = part.record.mask & part.held[..., None] & np.isfinite(mean)
+    return np.where(seen, part.record.observed - mean, np.nan), np.where(seen, last, 0.0)
+
+
+def _hold(errors: NDArray, deviation: NDArray) -> bool:
+    """Whether 90 % bands hold so many errors (r, T, d_y) of each output, within chance."""
+    for error, size in zip(np.moveaxis(errors, 2, 0), deviation, strict=True):
+        seen = np.isfinite(error)
+        inside = np.abs(error) <= USUAL * size
+        around = np.where(seen, inside - inside[seen].mean(), 0.0)
+        number = seen.sum() / correlation_time(around[..., None])
+        chance = USUAL * np.sqrt(LEVEL * (1 - LEVEL) / number)
+        if inside[seen].mean() < LEVEL - chance:
+            return False
+    return True
 
 
 def _calibrated(pairs: Sequence[tuple[NDArray, NDArray]], channel: int) -> tuple[float, ...]:
-    """Persistence, deviation and number of independent errors of an output."""
+    """Persistence, deviation, number of independent errors, and their correlation time."""
     errors = [each[..., channel] for each, _ in pairs]
     last = np.concatenate(
         [each[..., channel][np.isfinite(e)] for (_, each), e in zip(pairs, errors, strict=True)]
     )
     flat = np.concatenate([each[np.isfinite(each)] for each in errors])
     if not len(flat):
-        return 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     power = float(last @ last)
     share = float(np.clip(last @ flat / power, 0.0, 1.0)) if power > 0 else 0.0
     left = flat - share * last
@@ -174,4 +251,4 @@ def _calibrated(pairs: Sequence[tuple[NDArray, NDArray]], channel: int) -> tuple
     for (_, each), error in zip(pairs, errors, strict=True):
         rest = np.where(np.isfinite(error), error - share * each[..., channel], 0.0)
         number += np.isfinite(error).sum() / correlation_time(rest[..., None])
-    return share, conformal_deviation(left, number), number
+    return share, predictive_deviation(left, number), number, len(flat) / number

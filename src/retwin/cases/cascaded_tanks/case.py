@@ -18,7 +18,6 @@ from dataclasses import replace
 from retwin.cases.cascaded_tanks.twin import OVERFLOWING_TANKS, RATE, TANKS
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
-from retwin.data.trajectories import HEALTHY
 from retwin.nets.networks import LSTM
 from retwin.nets.training import Training
 from retwin.twins.samplers import MultisineSampler
@@ -85,9 +84,7 @@ def tanks() -> Case:
     return Case(
         name="tanks",
         title="Cascaded tanks",
-        faults={HEALTHY: None},
         twin=TANKS,
-        emulator=None,
         sampler=VOLTAGES,
         correction=Additive(),
         output_correction=Additive(),

@@ -10,7 +10,6 @@ from __future__ import annotations
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.silver_box.twin import SILVERBOX
-from retwin.data.trajectories import HEALTHY
 from retwin.nets.networks import LSTM
 from retwin.twins.samplers import MultisineSampler
 from retwin.update.corrections import Additive
@@ -38,9 +37,7 @@ def silverbox() -> Case:
     return Case(
         name="silverbox",
         title="Silverbox",
-        faults={HEALTHY: None},
         twin=SILVERBOX,
-        emulator=None,
         sampler=MultisineSampler(
             (-0.2,), (0.2,), SILVERBOX.rate, 1024 / SILVERBOX.rate, (1.0, 200.0), deviation=(0.05,)
         ),

@@ -13,7 +13,6 @@ from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
 from retwin.cases.time_column import TimeColumn
-from retwin.data.trajectories import HEALTHY
 from retwin.nets.networks import LSTM
 from retwin.twins.faults import Fault
 from retwin.twins.samplers import HoldSampler
@@ -88,9 +87,7 @@ def incubator() -> Case:
     return Case(
         name="incubator",
         title="Incubator",
-        faults={HEALTHY: None},
         twin=INCUBATOR,
-        emulator=None,
         sampler=HoldSampler((0.0, 20.0), (1.0, 25.0), INCUBATOR.rate, 3000.0, (30.0, 600.0)),
         correction=Additive(),
         output_correction=Additive(),

@@ -14,6 +14,7 @@ _HOME = homes(
         "fitting": "fit",
         "scoring": "ModelScore predict_records score_model",
         "settings": "Choice",
+        "surrogates": "StandIn SurrogateSettings stand_in",
     }
 )
 

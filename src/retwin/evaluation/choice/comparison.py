@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -147,7 +147,7 @@ class Comparison:
         """Whether a simulation left any reasonable range."""
         return any(
             not np.nanmax(np.abs(self.errors(name, i)) / self.spread, initial=0.0) < LARGE
-            for i in range(len(self.folds))
+            for i in self._all
         )
 
     def scores(self, name: str, i: int) -> NDArray:
@@ -160,20 +160,14 @@ class Comparison:
 
     def block_scores(self, name: str) -> NDArray:
         """Mean scores (B,) of nearly independent blocks, which are the same for all models."""
-        made = []
-        for i in range(len(self.folds)):
-            values = self.scores(name, i)
-            made.append(block_means(values, self._lengths[i]))
+        made = [block_means(self.scores(name, i), self._lengths[i]) for i in self._all]
         return np.concatenate(made)
 
     @cached_property
     def _lengths(self) -> list[int]:
         first = next(iter(self.predicted))
-        lengths = []
-        for i in range(len(self.folds)):
-            values = self.scores(first, i)
-            lengths.append(block_length(np.nan_to_num(values), np.isfinite(values)))
-        return lengths
+        scores = [self.scores(first, i) for i in self._all]
+        return [block_length(np.nan_to_num(each), np.isfinite(each)) for each in scores]
 
     def rmse(self, name: str) -> NDArray:
         """Root mean square errors (d_y,) of the parts that were left out."""
@@ -192,6 +186,18 @@ class Comparison:
     @property
     def _all(self) -> range:
         return range(len(self.folds))
+
+    def joined(self, parts: Callable[[int], NDArray]) -> NDArray:
+        """What `parts` (r, T, d_y) gives for each part in time, as one array (n, T, d_y).
+
+        It is NaN where nothing was left out.
+        """
+        made = np.full(self.records.observed.shape, np.nan)
+        for i, fold in enumerate(self.folds):
+            if not fold.edge:
+                held = fold.held[fold.rows][..., None]
+                made[fold.rows] = np.where(held, parts(i), made[fold.rows])
+        return made
 
     def simplest(self) -> tuple[str, dict[str, tuple[float, float]]]:
         """The simplest model within one standard error of the best one (Breiman et al., 1984).

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import time
-import warnings
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -16,12 +17,12 @@ from retwin.checks import require
 from retwin.data.measured import check_magnitude
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.choice.candidates import Candidates, Model
-from retwin.evaluation.choice.comparison import Comparison, Predicted, predict
+from retwin.evaluation.choice.comparison import Comparison
 from retwin.evaluation.choice.fitted import CandidateScore, Fitted
-from retwin.evaluation.choice.folds import block_length, block_means, folds_of
+from retwin.evaluation.choice.folds import Fold, block_length, block_means, folds_of
 from retwin.evaluation.choice.remarks import remarks_of, without_twin
 from retwin.evaluation.choice.settings import MEMBERS, Choice
-from retwin.evaluation.choice.trials import FAILURES, Trials, shorter, unstable
+from retwin.evaluation.choice.trials import Trials, shorter, unstable
 from retwin.progress import Progress
 from retwin.scores.distributions import crps_normal
 from retwin.twins.parametric import ParametricTwin
@@ -32,7 +33,13 @@ from retwin.update.corrections import Additive
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.forecast_errors import ForecastErrors
-from retwin.update.forecasts import LEADS, calibrate_forecasts, forecasts, free_moments
+from retwin.update.forecasts import (
+    LEADS,
+    LeftOut,
+    calibrate_forecasts,
+    forecasts,
+    free_moments,
+)
 from retwin.update.residual.fitting import calibrating
 from retwin.workers.threads import one_thread
 
@@ -104,8 +111,7 @@ def fit(
     if given is not None and not settings.compared:
         return _fit_alone(whole, given, time.process_time() - since, began)
     folds = folds_of(records)
-    trials = Trials(whole, folds, names, progress or (lambda _: None))
-    trials.run()
+    trials = _run_trials(whole, folds, names, progress)
     comparison, reasons = trials.compare(settings.horizon)
     horizon = settings.horizon
     if horizon is None and unstable(comparison, whole):
@@ -120,7 +126,7 @@ def fit(
     )
     preferred, differences = comparison.simplest()
     chosen = settings.method or preferred
-    model = _calibrate(given or trials.final(chosen), trials, chosen, comparison)
+    model = _calibrate(given or whole.fits[chosen](), trials, chosen, comparison)
     scores = tuple(
         _row(name, comparison, differences, trials.seconds[name], reasons.get(name, ""))
         for name in trials.names
@@ -145,6 +151,29 @@ def fit(
         seconds=time.perf_counter() - began,
     )
     return with_yardstick(found, seed=seed) if settings.yardstick else found
+
+
+def _run_trials(
+    whole: Candidates, folds: list[Fold], names: list[str], progress: Progress | None
+) -> Trials:
+    """The fits of candidates without each fold, of which one at least succeeds."""
+    part = len(folds) / (len(folds) + 1)  # the rest is the fit to all records
+    trials = Trials(
+        whole.records,
+        folds,
+        names,
+        lambda own: replace(whole, records=own, settings=whole.settings.lighter).fits,
+        progress and (lambda share: progress(part * share)),
+    )
+    trials.run()
+    require(
+        len(trials.reasons) < len(names),
+        "records",
+        expected="records to which a candidate can be fitted without a part of them",
+        got="; ".join(f"{name}: {reason}" for name, reason in trials.reasons.items()),
+        remedy="give longer or more records",
+    )
+    return trials
 
 
 def _fit_alone(whole: Candidates, model: Model, taken: float, began: float) -> Fitted:
@@ -196,16 +225,16 @@ def _names(candidates: Candidates, settings: Choice) -> list[str]:
 
 def _calibrate(model: Model, trials: Trials, name: str, comparison: Comparison) -> Model:
     """The model with bands that hold what the parts in time show."""
-    records, found = trials.whole.records, []
+    records, found = trials.records, []
     if name not in comparison.predicted:
         return model
     leads = [each for each in LEADS if 4 * each <= records.steps]
     for one, fold in zip(trials.models[name], trials.folds, strict=True):
-        if not fold.edge:
-            own = records[fold.rows]
-            free = free_moments(one, own.commands)[0]
-            found.append((forecasts(one, own, leads), free, own, fold.held[fold.rows]))
-    forecast = calibrate_forecasts(found, leads)
+        own = records[fold.rows]
+        free = free_moments(one, own.commands)[0]
+        part = (forecasts(one, own, leads), free, own, fold.held[fold.rows])
+        found.append(LeftOut(*part, fold.excess(records), fold.edge))
+    forecast = calibrate_forecasts(records, found, leads)
     if comparison.constant[name].any():
         assert isinstance(model, DynamicsTwin)
         constant = np.where(comparison.constant[name], forecast.deviation[-1], 0.0)
@@ -242,35 +271,23 @@ def with_yardstick(found: Fitted, *, seed: int = 0, progress: Progress | None = 
         Called with the share of the work that is done.
 
     """
-    began, records, report = time.perf_counter(), found.records, progress or (lambda _: None)
-    folds = folds_of(records)
-    predicted: dict[str, list[Predicted]] = {}
-    seconds, reasons = dict.fromkeys(BLACK_BOXES, 0.0), {}
-    for i, kind in enumerate(BLACK_BOXES):
-        since = time.process_time()
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                predicted[kind] = []
-                for j, fold in enumerate(folds):
-                    training = fold.training(records)
-                    model = fit_black_box(training, kind, members=MEMBERS, seed=seed).twin
-                    predicted[kind].append(predict(model, records, fold, found.horizon))
-                    report((i + (j + 1) / len(folds)) / len(BLACK_BOXES))
-        except FAILURES as error:
-            reasons[kind] = str(error)
-            del predicted[kind]
-        seconds[kind] = time.process_time() - since
-    comparison = Comparison(records, folds, predicted)
-    rows = []
-    for kind in BLACK_BOXES:
-        if kind in predicted and comparison.diverged(kind):
-            reasons[kind] = "its simulation diverges"
-        behind = {kind: (float("nan"), float("nan"))}
-        if kind in predicted and kind not in reasons:
-            behind[kind] = _behind(found, comparison, kind)
-        row = _row(kind, comparison, behind, seconds[kind], reasons.get(kind, ""))
-        rows.append(replace(row, uses_twin=False))
+    began, records = time.perf_counter(), found.records
+
+    def fits(training: Trajectories) -> dict[str, Callable[[], object]]:
+        made = partial(fit_black_box, training, members=MEMBERS, seed=seed)
+        return {kind: lambda kind=kind: made(kind).twin for kind in BLACK_BOXES}  # type: ignore[misc]
+
+    trials = Trials(records, folds_of(records), list(BLACK_BOXES), fits, progress)
+    trials.run()
+    comparison, reasons = trials.compare(found.horizon)
+    behind = {kind: _behind(found, comparison, kind) for kind in comparison.predicted}
+    rows = [
+        replace(
+            _row(kind, comparison, behind, trials.seconds[kind], reasons.get(kind, "")),
+            uses_twin=False,
+        )
+        for kind in BLACK_BOXES
+    ]
     own = [each for each in found.scores if each.uses_twin]
     return replace(
         found,
@@ -326,18 +343,12 @@ def _row(
 
 def _shown(comparison: Comparison, name: str) -> tuple[NDArray, NDArray]:
     """Predictions (n, T, d_y) of the parts in time that were left out, and their deviations."""
-    shape = comparison.records.observed.shape
-    mean, deviation = np.full(shape, np.nan), np.full(shape, np.nan)
     if name not in comparison.predicted:
-        return mean, deviation
-    measured = comparison.records.observed
-    for i, fold in enumerate(comparison.folds):
-        if not fold.edge:
-            rows, held = fold.rows, fold.held[fold.rows][..., None]
-            made = measured[rows] - comparison.errors(name, i)
-            mean[rows] = np.where(held, made, mean[rows])
-            deviation[rows] = np.where(held, comparison.deviation(name, i), deviation[rows])
-    return mean, deviation
+        nothing = np.full(comparison.records.observed.shape, np.nan)
+        return nothing, nothing
+    observed, folds = comparison.records.observed, comparison.folds
+    mean = comparison.joined(lambda i: observed[folds[i].rows] - comparison.errors(name, i))
+    return mean, comparison.joined(lambda i: comparison.deviation(name, i))
 
 
 def _parameters(whole: Candidates, model: Model) -> dict[str, tuple[float, float, float]]:

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.update.dynamics.estimation import correlation_time
+from retwin.update.forecast_errors import range_excess, value_range
+from retwin.update.forecasts import values_of
 
 RECORDS = 4
 """Records from which on whole ones are left out, in so many groups at most."""
@@ -54,6 +56,13 @@ class Fold:
         kept = np.flatnonzero(~self.held.all(axis=1))
         mask = records.mask & ~self.held[..., None]
         return records.replace(mask=mask)[kept]
+
+    def excess(self, records: Trajectories) -> float:
+        """How far its values leave the range of the others, in widths of that."""
+        values = values_of(records)
+        others = np.where(self.held[..., None], np.nan, values)
+        held = np.where(self.held[..., None], values, np.nan)
+        return float(range_excess(held, *value_range(others)).max())
 
 
 def folds_of(records: Trajectories) -> list[Fold]:

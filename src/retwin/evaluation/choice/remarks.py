@@ -72,13 +72,8 @@ def _worse_than_mean(records: Trajectories, score: CandidateScore) -> list[str]:
 
 def _of_twin(records: Trajectories, comparison: Comparison, name: str) -> list[str]:
     """A wrong sign and a missing dead time of the twin, by its own simulations."""
-    made, shape = [], records.observed.shape
-    nominal = np.full(shape, np.nan)
-    for i, fold in enumerate(comparison.folds):
-        if not fold.edge:
-            held = fold.held[fold.rows][..., None]
-            own = np.where(held, comparison.predicted[name][i].mean, np.nan)
-            nominal[fold.rows] = np.where(held, own, nominal[fold.rows])
+    made = []
+    nominal = comparison.joined(lambda i: comparison.predicted[name][i].mean)
     for channel, output in enumerate(records.outputs.names):
         y = np.where(records.mask[..., channel], records.observed[..., channel], np.nan)
         y, x = y.astype(np.float64), nominal[..., channel]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from retwin.scores.distributions import crps_normal
 from retwin.twins.twin import Twin, check_channels
 from retwin.update.forecast_errors import USUAL, ForecastErrors
 from retwin.update.forecasts import forecasts, free_moments
+from retwin.update.training_range import OutsideTrainingWarning
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,8 @@ class ScoredPrediction:
     Attributes
     ----------
     mean, deviation : NDArray
-        (n, T, d_y); NaN where nothing is predicted.
+        (n, T, d_y); the mean is NaN where nothing is predicted, and the deviation where no band
+        was calibrated.
 
     """
 
@@ -77,23 +80,55 @@ def predict_records(
     seed : int
         Of draws.
 
+    Warns
+    -----
+    OutsideTrainingWarning
+        Commands or predicted outputs leave the range for which bands were calibrated, so that
+        there is none until the errors there are forgotten.
+
     """
     check_channels(model, records, "records")
-    if horizon is None:
-        return ScoredPrediction(*free_moments(model, records.commands, seed=seed))
     errors: ForecastErrors | None = getattr(model, "forecast", None)
-    lead = max(1, round(positive("horizon", horizon) * records.rate))
-    require(
-        lead < records.steps,
-        "horizon",
-        expected=f"a time shorter than the records, {records.steps / records.rate:g} s",
-        got=f"{horizon:g} s",
-        remedy="give a shorter one, or none for free simulation",
-    )
-    made = forecasts(model, records, [lead])
-    share, deviation = (0.0, np.nan) if errors is None else errors.at(lead / records.rate)
-    mean = made.mean[0] + share * made.last[0]
-    return ScoredPrediction(mean, np.broadcast_to(deviation, mean.shape))
+    if horizon is None:
+        mean, deviation = free_moments(model, records.commands, seed=seed)
+    else:
+        ahead = max(1, round(positive("horizon", horizon) * records.rate))
+        require(
+            ahead < records.steps,
+            "horizon",
+            expected=f"a time shorter than the records, {records.steps / records.rate:g} s",
+            got=f"{horizon:g} s",
+            remedy="give a shorter one, or none for free simulation",
+        )
+        made = forecasts(model, records, [ahead])
+        share, constant = (0.0, np.nan) if errors is None else errors.at(ahead / records.rate)
+        mean = made.mean[0] + share * made.last[0]
+        deviation = np.broadcast_to(constant, mean.shape)
+    if errors is not None:
+        values = np.concatenate([records.commands, mean], axis=2)
+        outside = errors.outside(values, records.rate)
+        deviation = np.where(outside[..., None], np.nan, deviation)
+        _warn_outside(outside, records)
+    return ScoredPrediction(mean, deviation)
+
+
+def _warn_outside(outside: NDArray, records: Trajectories) -> None:
+    """Warn of records in which samples (n, T) have no band."""
+    measured = np.arange(outside.shape[1]) < records.lengths[:, None]
+    first = {
+        str(name): float(np.argmax(own)) / records.rate
+        for name, own in zip(records.ids, outside & measured, strict=True)
+        if own.any()
+    }
+    if first:
+        name, time = min(first.items(), key=lambda item: item[1])
+        warnings.warn(
+            f"commands or outputs of {len(first)} of {len(records)} records leave the range for "
+            f"which bands were calibrated, {name} after {time:.4g} s; no band is given there. "
+            "Calibrate with records that contain these",
+            OutsideTrainingWarning,
+            stacklevel=3,
+        )
 
 
 def score_model(
@@ -172,8 +207,9 @@ def _scores(error: NDArray, deviation: NDArray) -> tuple[float, float, float, fl
     each = np.where(certain, np.abs(error), crps_normal(error, np.zeros_like(error), scale))
     if certain.all():
         return rmse, float(each.mean()), float("nan"), float("nan")
-    inside = np.abs(error) <= USUAL * deviation
-    return rmse, float(each.mean()), float(inside.mean()), float(2 * USUAL * deviation.mean())
+    inside = (np.abs(error) <= USUAL * deviation)[~certain]
+    width = 2 * USUAL * float(deviation[~certain].mean())
+    return rmse, float(each.mean()), float(inside.mean()), width
 
 
 def _baselines(records: Trajectories, horizon: float | None) -> dict[str, ScoredPrediction]:

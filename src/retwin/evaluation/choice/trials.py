@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from retwin.checks import require
+from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
-from retwin.evaluation.choice.candidates import Candidates, Model
+from retwin.evaluation.choice.candidates import Candidates
 from retwin.evaluation.choice.comparison import Comparison, predict
 from retwin.evaluation.choice.folds import Fold
 from retwin.progress import Progress
@@ -25,37 +26,51 @@ SHORT = 0.05
 
 @dataclass(eq=False)
 class Trials:
-    """The fits of all candidates without each fold."""
+    """The fits of some models without each fold.
 
-    whole: Candidates
+    Attributes
+    ----------
+    records : Trajectories
+        All records.
+    folds : sequence of Fold
+        What is left out in turn.
+    names : sequence of str
+        The models, the simplest first.
+    fits : callable
+        From the records without a fold to functions by name that fit the models to these.
+    progress : callable, optional
+        Called with the share that is done.
+    models : dict of str to list
+        By name, the model of each fold, as far as all were fitted.
+    reasons : dict of str to str
+        Why others were not.
+    seconds : dict of str to float
+        Processor time of all fits.
+
+    """
+
+    records: Trajectories
     folds: Sequence[Fold]
     names: Sequence[str]
-    progress: Progress
-    models: dict[str, list[Model]] = field(default_factory=dict)
+    fits: Callable[[Trajectories], Mapping[str, Callable[[], Any]]]
+    progress: Progress | None = None
+    models: dict[str, list[Any]] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
     def run(self) -> None:
         """Fit all."""
-        total, done = len(self.names) * len(self.folds) + len(self.names), 0
+        total, done = len(self.names) * len(self.folds), 0
         for fold in self.folds:
-            training = fold.training(self.whole.records)
-            own = replace(self.whole, records=training, settings=self.whole.settings.lighter)
-            fits = own.fits
+            fits = self.fits(fold.training(self.records))
             for name in self.names:
                 if name not in self.reasons:
-                    self._try(name, fits.get(name), fold)
+                    self._try(name, fits.get(name))
                 done += 1
-                self.progress(done / total)
-        require(
-            len(self.reasons) < len(self.names),
-            "records",
-            expected="records to which a candidate can be fitted without a part of them",
-            got="; ".join(f"{name}: {reason}" for name, reason in self.reasons.items()),
-            remedy="give longer or more records",
-        )
+                if self.progress is not None:
+                    self.progress(done / total)
 
-    def _try(self, name: str, fit: Callable[[], Model] | None, fold: Fold) -> None:
+    def _try(self, name: str, fit: Callable[[], Any] | None) -> None:
         began = time.process_time()
         try:
             with warnings.catch_warnings():
@@ -69,8 +84,8 @@ class Trials:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.process_time() - began
 
     def compare(self, horizon: float | None) -> tuple[Comparison, dict[str, str]]:
-        """Of the candidates whose predictions stay finite, and why others have none."""
-        records, reasons, predicted = self.whole.records, dict(self.reasons), {}
+        """Of the models whose predictions stay finite, and why others have none."""
+        records, reasons, predicted = self.records, dict(self.reasons), {}
         for name in (each for each in self.names if each not in reasons):
             pairs = zip(self.models[name], self.folds, strict=True)
             try:
@@ -85,10 +100,6 @@ class Trials:
             else:
                 predicted[name] = made
         return Comparison(records, self.folds, predicted), reasons
-
-    def final(self, name: str) -> Model:
-        """The candidate, fitted to all records."""
-        return self.whole.fits[name]()
 
 
 def unstable(comparison: Comparison, whole: Candidates) -> bool:

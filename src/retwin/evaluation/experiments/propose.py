@@ -203,16 +203,13 @@ def next_experiments(
     random = (1 + random) * unsure - 1
     gains = [_gain(*pair) for pair in pairwise(every)]
     excess = (1 + np.array([each.excess for each in every])) * unsure - 1
+    counts = range(count + 1)
     return Proposal(
         commands=drawn[picked[:count]],
         gains=tuple(gains[:count]),
         random_gain=float(now.gains(roots).mean()),
-        ahead=tuple(
-            Expected(len(healthy) + k, _spread(excess[k : k + 1])) for k in range(count + 1)
-        ),
-        ahead_random=tuple(
-            Expected(len(healthy) + k, _spread(random[:, k])) for k in range(count + 1)
-        ),
+        ahead=tuple(Expected(len(healthy) + k, _spread(excess[[k]])) for k in counts),
+        ahead_random=tuple(Expected(len(healthy) + k, _spread(random[:, k])) for k in counts),
         curve=curve,
         needed=_first(excess, tolerance),
         needed_random=_first(random.mean(axis=0), tolerance),

@@ -38,18 +38,9 @@ MIN_TRAJECTORIES = 8
 MAX_PLACES = 512
 """Largest number of values at which two distributions are compared, which bounds the memory."""
 _KEYS = {
-    "ids": "ids",
-    "nominal": "nominal",
-    "observed": "observed",
-    "seen": "seen",
-    "bands": "bands",
-    "crps": "crps",
-    "energy": "energy",
-    "pit": "pit",
+    **{name: name for name in ("ids", "nominal", "observed", "seen", "bands", "crps", "energy")},
+    **{name: name for name in ("pit", "features", "widening", "at_bound")},
     "segment_values": "movements",
-    "features": "features",
-    "widening": "widening",
-    "at_bound": "at_bound",
 }
 """Attributes with one row per trajectory, and their keys in NPZ files."""
 
@@ -155,11 +146,8 @@ class Fidelity:
         arrays: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in padded]) for name in _KEYS
         }
-        rivals = {
-            name: (
-                np.concatenate([part.rivals[name][0] for part in parts]),
-                np.concatenate([part.rivals[name][1] for part in parts]),
-            )
+        rivals: dict[str, Any] = {
+            name: tuple(map(np.concatenate, zip(*(p.rivals[name] for p in parts), strict=True)))
             for name in parts[0].rivals
         }
         return replace(parts[0], rivals=rivals, **arrays)

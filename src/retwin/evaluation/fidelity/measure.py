@@ -110,11 +110,8 @@ def measure_fidelity(
         members = ensemble.members[: INFERRED + 1]
         row["segment_values"] = _segment_values(twin, members, segments[[i]], stride, operator)
         rows.append(row)
-    rivals = {
-        name: (
-            np.stack([row[f"rival/{name}"][0] for row in rows]),
-            np.array([row[f"rival/{name}"][1] for row in rows]),
-        )
+    rivals: dict[str, Any] = {
+        name: tuple(map(np.array, zip(*(row[f"rival/{name}"] for row in rows), strict=True)))
         for name in against
     }
     names = (

@@ -166,14 +166,8 @@ def _of_fit(before: ParametricTwin, found: Updated) -> Uncertainty:
     # A search leaves a parameter without effect where it began, which may be a bound.
     bound = local.at_bound & np.isfinite(local.errors)
     sides = [end if at else "" for end, at in zip(ends, bound, strict=True)]
-    made = tuple(
-        replace(each, depends=bool(depends))
-        for each, depends in zip(
-            estimates(before, values, errors, intervals, local.identified, sides),
-            local.depends,
-            strict=True,
-        )
-    )
+    about = values, errors, intervals, local.identified, sides
+    made = estimates(before, *about, depends=local.depends)
     return Uncertainty(made, local.correlation, directions, basis)
 
 
@@ -217,10 +211,12 @@ def estimates(
     sides: Sequence[str],
     *,
     bounded: bool = False,
+    depends: Sequence[bool] | NDArray = (),
 ) -> tuple[ParameterEstimate, ...]:
     """One estimate per parameter; at a bound a fit has no error, whose theory ends there.
 
-    `agreed` states which may be identified by what is known beside their intervals.
+    `agreed` states which may be identified by what is known beside their intervals, and `depends`
+    which depend on the bound of another one: none by default.
     """
     made = []
     for i, each in enumerate(before.parameters):
@@ -237,6 +233,7 @@ def estimates(
             (float(intervals[i][0]), float(intervals[i][1])) if known else None,
             False,
             sides[i],  # type: ignore[arg-type]
+            bool(len(depends) and depends[i]),
         )
         narrow = estimate.covered is not None and estimate.covered <= WIDEST
         inside = narrow and not estimate.leaves and not sides[i]

@@ -231,14 +231,10 @@ def validate_identification(
     for part, measured in parts.items():
         checked_stride(before, measured, None, part)
         simulated[part] = _simulated(before, mean, measured, used, horizon, seed)
-    uncertainty = uncertainty_of(before, found)
     last = simulated["validation" if held_out is not None else "identification"]
     return Identification(
         twin=mean,
-        parameters=uncertainty.parameters,
-        correlation=uncertainty.correlation,
-        directions=uncertainty.directions,
-        basis=uncertainty.basis,
+        **vars(uncertainty_of(before, found)),
         outputs=_outputs(simulated, used),
         residuals=residual_tests(_residual(last[0], last[2]), last[0]),
         split=_split(used, held_out),

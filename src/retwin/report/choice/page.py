@@ -48,6 +48,7 @@ def fit_page(found: Fitted, folder: str, *, title: str) -> str:
         sentences=model_sentences(found),
         bands=_bands(found),
         promised=forecast is not None and forecast.promised,
+        beyond=forecast.beyond if forecast else 0.0,
         figures=figures,
     )
 

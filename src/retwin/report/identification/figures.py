@@ -11,14 +11,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.evaluation.identification import Identification
 from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row, record_panel
 from retwin.report.labels import behind
-from retwin.report.residual_panels import (
-    WHITE,
-    ChannelRecords,
-    Errors,
-    autocorrelation_panel,
-    cross_correlation_panel,
-    spectrum_panel,
-)
+from retwin.report.residual_panels import ChannelRecords, Errors, residual_figures
 
 OUTPUTS, INPUTS = 6, 3
 """Outputs and inputs of which figures are drawn, at most."""
@@ -113,9 +106,7 @@ def _typical(measured: Trajectories, after: NDArray) -> int:
     return int(known[np.argsort(mean[known])[(len(known) - 1) // 2]])
 
 
-def _residuals(
-    measured: Trajectories, errors: list[NDArray], shown: list[int]
-) -> tuple[Figure, ...]:
+def _residuals(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> list[Figure]:
     """Correlations and spectra of the residuals after and before, of outputs that have some."""
     about, rate = measured.outputs, measured.rate
     drawn = []
@@ -130,14 +121,7 @@ def _residuals(
         for j, name in enumerate(measured.inputs.names[:INPUTS])
         if np.ptp(measured.commands[..., j]) > 0
     ]
-    limits = [Key(f"95 % limits, {key.text}", key.colour, "bar") for key in KEYS]
-    crossed = [cross_correlation_panel(each, of, rate) for each in drawn for of in commands]
-    densities = [spectrum_panel(each, rate) for each in drawn]
-    return (
-        Figure("autocorrelation", [autocorrelation_panel(e, rate) for e in drawn], [*KEYS, WHITE]),
-        Figure("crosscorrelation", crossed, [*KEYS, *limits]),
-        Figure("spectra", [e for e in densities if e], [Key("measured output", MEASURED), *KEYS]),
-    )
+    return residual_figures(drawn, commands, KEYS, rate)
 
 
 def _useful(residual: NDArray) -> bool:

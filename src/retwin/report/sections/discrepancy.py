@@ -41,8 +41,8 @@ def discrepancy(study: Study) -> Section | None:
     """One segment, observed and generated distributions of z, and tests of their agreement."""
     found = segment(study)
     example = None if found is None else segment_figure(found)
-    groups = [_groups(study, source) for source in suffixes(study)]
-    shown = [group for each in groups for group in each if group["source"] in detailed(study)]
+    groups = [group for source in suffixes(study) for group in _groups(study, source)]
+    shown = [group for group in groups if group["source"] in detailed(study)]
     tables = [
         {"table": table, "segments": study.results.fidelity[source].segments}
         for source in detailed(study)
@@ -51,12 +51,7 @@ def discrepancy(study: Study) -> Section | None:
     if example is None and not shown and not tables:
         return None
     figures = ([example] if example else []) + [group["figure"] for group in shown]
-    further = [
-        group["figure"]
-        for each in groups
-        for group in each
-        if group["source"] not in detailed(study)
-    ]
+    further = [group["figure"] for group in groups if group not in shown]
     values = {"segment": found, "example": example, "groups": shown, "tables": tables}
     return Section("discrepancy", "Discrepancy", values, figures, further)
 

@@ -20,6 +20,11 @@ from retwin.report.study import Study
 
 TABLE1 = tuple(name for name in MAIN if not METRICS[name].simulated)
 """The metrics of the paper's Table 1."""
+FIGURES = (
+    ("Figure 3: confusions, accuracy", "accuracy", Link("Confusions", "confusion")),
+    ("Figure 4: micro-averaged ROC, area", "auroc_micro", Link("ROC", "roc")),
+)
+"""Figures of the paper, a metric that sums each up, and where it stands on the page."""
 
 
 def paper(study: Study) -> Section | None:
@@ -33,7 +38,6 @@ def paper(study: Study) -> Section | None:
         *grouped("this study", *map(source_name, known)),
         text_column("on this page"),
     ]
-    dashes = ["–"] * len(known)
     rows = [
         *(
             _row(
@@ -44,17 +48,9 @@ def paper(study: Study) -> Section | None:
             )
             for metric in TABLE1
         ),
-        _row(
-            "Figure 3: confusions, accuracy",
-            dashes,
-            _means(study, known, "accuracy"),
-            Link("Confusions", "confusion"),
-        ),
-        _row(
-            "Figure 4: micro-averaged ROC, area",
-            dashes,
-            _means(study, known, "auroc_micro"),
-            Link("ROC", "roc"),
+        *(
+            _row(what, ["–"] * len(known), _means(study, known, metric), link)
+            for what, metric, link in FIGURES
         ),
         *_distributions(study, known),
         _row(

@@ -12,14 +12,11 @@ from retwin.report.blocks import Cell, Section, Table, tabulate
 from retwin.report.figure import Axis, Figure, Key, Mark, Panel, Points, Row, Spans
 from retwin.report.labels import decimals, number, p_value, quantity, source_name, with_unit
 from retwin.report.residual_panels import (
-    WHITE,
     ChannelRecords,
     Errors,
-    autocorrelation_panel,
-    cross_correlation_panel,
     line,
     log_axis,
-    spectrum_panel,
+    residual_figures,
 )
 from retwin.report.study import Study
 from retwin.report.style import colour_of, dash
@@ -71,9 +68,6 @@ def _figures(
     ranged = any(np.isfinite([each.output.low, each.output.high]).any() for each in errors)
     rate, errors, drawn = _rate(study), errors[:OUTPUTS], commands[:COMMANDS]
     keys = list(errors[0].by_key)
-    limits = [Key(f"95 % limits, {key.text}", key.colour, "bar") for key in keys]
-    correlated = [cross_correlation_panel(each, of, rate) for each in errors for of in drawn]
-    densities = [spectrum_panel(each, rate) for each in errors]
     amplitudes = [_amplitudes(each, of) for each in errors for of in (each.output, *drawn)]
     beyond, late = (
         [Key("outside the range of the calibration", "grid", "bar")] * bool(known)
@@ -81,9 +75,7 @@ def _figures(
     )
     over_time = [_over_time(each, np.any(outside, axis=0), rate) for each in errors]
     return [
-        Figure("autocorrelation", [autocorrelation_panel(e, rate) for e in errors], [*keys, WHITE]),
-        Figure("crosscorrelation", correlated, [*keys, *limits]),
-        Figure("spectra", [e for e in densities if e], [Key("measured output", "ink"), *keys]),
+        *residual_figures(errors, drawn, keys, rate),
         Figure("amplitude", [e for e in amplitudes if e], [*keys, *beyond]),
         Figure("overtime", over_time, [*keys, *late], columns=1),
     ]

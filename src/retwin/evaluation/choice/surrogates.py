@@ -38,7 +38,7 @@ need states, others a long memory."""
 
 
 @dataclass(frozen=True)
-class Simulating:
+class SurrogateSettings:
     """How the simulations for a surrogate are made, and how it is trained.
 
     Parameters
@@ -96,7 +96,7 @@ class StandIn:
 def stand_in(
     twin: Twin,
     records: Trajectories,
-    settings: Simulating = Simulating(),
+    settings: SurrogateSettings = SurrogateSettings(),
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -109,7 +109,7 @@ def stand_in(
         Any twin.
     records : Trajectories
         Measured outputs with the commands for which the surrogate must follow the twin.
-    settings : Simulating
+    settings : SurrogateSettings
         Whether there is a surrogate, and how it is trained.
     seed : int
         Of commands and weights.
@@ -200,7 +200,7 @@ def _failure(surrogate: Surrogate, twin: Twin, records: Trajectories) -> str:
 def _simulations_for(
     twin: Twin,
     records: Trajectories,
-    settings: Simulating,
+    settings: SurrogateSettings,
     seed: int,
     progress: Progress | None = None,
 ) -> tuple[Trajectories, str]:

@@ -1,0 +1,165 @@
+"""What 95 % intervals of `rt.identify` hold where the twin is right, and where it is broken.
+
+Four emulated systems, one record of 1000 samples each: a heater, a servo, a tank with a valve, a
+pendulum. Their records break the twin in turn: not at all (white noise); by coloured noise
+(autoregressive, 0.95, three times as large); by a term that the twin lacks (radiation, dry friction
+of the servo and of the pendulum, an outflow that grows with the level); by a sensor that clips a
+third of the range. The truth of a broken twin is the estimate from 100 records together. 300
+records are identified for each; targets: intervals hold 0.90 to 0.98, and where the twin is right
+they are hardly wider than those of independent errors.
+
+    python benchmarks/parameter_coverage.py [RECORDS]
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable
+from itertools import product
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from record import record
+from scipy.signal import lfilter
+
+import retwin as rt
+from retwin.evaluation.identification.parameters import uncertainty_of
+from retwin.twins import State, StateTwin
+from retwin.update.identification import LeastSquares
+from retwin.workers.pools import worker_pool
+
+RECORDS, MANY, STEPS, RATE = 300, 100, 1000, 10.0
+KINDS = ("right", "coloured noise", "missing term", "clipped")
+LACKING = "lacking"
+"""The parameter of the term that a twin lacks: 0 in the twin."""
+
+
+def heater(x, u, p):
+    return (p.gain * u.command - p.loss * x.heat - p.lacking * x.heat**2,)
+
+
+def servo(x, u, p):
+    dry = p.lacking * torch.tanh(x.speed / 0.02)
+    return x.speed, p.stiffness * (u.command - x.angle) - p.damping * x.speed - dry
+
+
+def tank(x, u, p):
+    level = torch.clamp(x.level, min=1e-3)
+    return (p.pump * u.command - p.outflow * torch.sqrt(level) - p.lacking * level,)
+
+
+def pendulum(x, u, p):
+    dry = p.lacking * torch.tanh(x.speed / 0.02)
+    return x.speed, p.torque * u.command - p.gravity * torch.sin(
+        x.angle
+    ) - p.friction * x.speed - dry
+
+
+def build(
+    derivative: Callable, states: str, lacking: float, low: float, high: float, **true: float
+) -> tuple[rt.ParametricTwin, dict[str, float], float, tuple[float, float]]:
+    """A twin whose first state is measured, the true values, and the range of commands."""
+    names = states.split()
+    values = [
+        rt.Parameter(name, "", value / 10, 10 * value, 1.3 * value) for name, value in true.items()
+    ]
+    twin = StateTwin(
+        [State(name, "", 1.0 if name == "level" else 0.0) for name in names],
+        lambda x, u: getattr(x, names[0]),
+        rt.Channels(("command",), ("",)),
+        rt.Channels((names[0],), ("",)),
+        RATE,
+        derivative=derivative,
+        parameters=(*values, rt.Parameter(LACKING, "", 0.0, 10.0, 0.0)),
+    )
+    return twin.parametric(), true, lacking, (low, high)
+
+
+SYSTEMS = {
+    "heater": build(heater, "heat", 0.02, 0.0, 2.0, gain=0.3, loss=0.1),
+    "servo": build(servo, "angle speed", 1.0, -1.0, 1.0, stiffness=20.0, damping=4.0),
+    "tank": build(tank, "level", 0.02, 0.5, 1.5, pump=0.2, outflow=0.15),
+    "pendulum": build(
+        pendulum, "angle speed", 0.3, -1.0, 1.0, torque=4.0, gravity=9.0, friction=0.8
+    ),
+}
+
+
+def records(name: str, kind: str, count: int, seed: int) -> rt.Trajectories:
+    """Measured records of a system, all with other commands and noise."""
+    twin, true, lacking, (low, high) = SYSTEMS[name]
+    rng = np.random.default_rng([seed, *name.encode(), *kind.encode()])
+    commands = rng.uniform(low, high, (count, STEPS // 25, 1)).repeat(25, axis=1)
+    made = twin.with_values(true | {LACKING: lacking if kind == "missing term" else 0.0})
+    made = made.simulate(commands, seed=seed)
+    clean = made.observed.astype(float)
+    noise = 0.03 * clean.std() * rng.normal(size=clean.shape)
+    if kind == "coloured noise":
+        noise = lfilter([3 * np.sqrt(1 - 0.95**2)], [1, -0.95], noise, axis=1)
+    outputs = clean + noise
+    if kind == "clipped":
+        ends = np.quantile(clean, [1 / 6, 5 / 6])
+        outputs = np.clip(outputs, *ends)
+    return made.replace(observed=outputs)
+
+
+def estimated(name: str, made: rt.Trajectories) -> tuple[NDArray, NDArray, NDArray]:
+    """Estimates, and the half widths of intervals by blocks and by independent errors."""
+    twin, true, *_ = SYSTEMS[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        before = twin.holding(LACKING)
+        found = rt.identify(before, made, LeastSquares(1), seed=0)
+    shown = uncertainty_of(before, found).parameters
+    ends = np.array([each.interval or (-np.inf, np.inf) for each in shown])
+    white = 1.96 * np.asarray(found.identifiability.white)
+    return np.array([found.values[each] for each in true]), np.diff(ends)[:, 0] / 2, white
+
+
+def study(name: str, kind: str, count: int) -> dict[str, float]:
+    """Shares of intervals that hold, by parameter, and the median of their relative widths."""
+    true = np.array(list(SYSTEMS[name][1].values()))
+    limit = true
+    if kind not in ("right", "coloured noise"):
+        limit = estimated(name, records(name, kind, MANY, 10_000))[0]
+    inside, ratios = [], []
+    for seed in range(count):
+        values, half, white = estimated(name, records(name, kind, 1, seed))
+        inside.append(np.abs(values - limit) <= half)
+        ratios.append(half / white)
+    shares = dict(zip(SYSTEMS[name][1], np.mean(inside, axis=0).tolist(), strict=True))
+    return {f"{key} holds": value for key, value in shares.items()} | {
+        "width over that of independent errors": float(np.median(ratios)),
+        "bias by the break, of the value": float(np.max(np.abs(limit / true - 1))),
+    }
+
+
+def main() -> None:
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else RECORDS
+    pairs = list(product(SYSTEMS, KINDS))
+    with worker_pool(2) as pool:
+        jobs = [pool.schedule(study, (*pair, count)) for pair in pairs]
+        found = {pair: job.result() for pair, job in zip(pairs, jobs, strict=True)}
+    rows = {
+        f"{name}, {kind}": {
+            "lowest share": min(v for k, v in each.items() if k.endswith("holds")),
+            "mean share": float(np.mean([v for k, v in each.items() if k.endswith("holds")])),
+            **{k: v for k, v in each.items() if not k.endswith("holds")},
+        }
+        for (name, kind), each in found.items()
+    }
+    for kind in KINDS:
+        shares = [
+            value
+            for (_, own), each in found.items()
+            for key, value in each.items()
+            if own == kind and key.endswith("holds")
+        ]
+        rows[f"all, {kind}"] = {"lowest share": min(shares), "mean share": float(np.mean(shares))}
+    record("parameter_coverage", f"95 % intervals of {count} records each", rows)
+
+
+if __name__ == "__main__":  # worker processes are spawned
+    main()

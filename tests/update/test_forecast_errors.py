@@ -1,0 +1,63 @@
+"""`ForecastErrors`: the size of bands, and where they are given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import retwin as rt
+from retwin.update.forecast_errors import (
+    USUAL,
+    ForecastErrors,
+    predictive_deviation,
+    range_excess,
+    value_range,
+)
+
+
+@pytest.mark.parametrize("independent", [6, 12, 200])
+def test_bands_of_few_independent_errors_hold_further_ones(independent: int) -> None:
+    rng = np.random.default_rng(0)
+    held = []
+    for _ in range(4000):
+        errors = rng.normal(size=independent)
+        size = predictive_deviation(np.repeat(errors, 10), independent)
+        held.append(abs(rng.normal()) <= USUAL * size)
+    # Quantiles of a handful of errors are rough.
+    assert np.mean(held) == pytest.approx(0.9, abs=0.03)
+
+
+def errors_with(memory: float) -> ForecastErrors:
+    one = np.ones((1, 1))
+    return ForecastErrors(
+        np.array([np.inf]), one, one, one, memory, np.array([0.0, -1.0]), np.array([2.0, 1.0]), 0.1
+    )
+
+
+def test_bands_end_where_a_value_leaves_its_range_until_that_is_forgotten() -> None:
+    values = np.zeros((3, 50, 2))
+    values[0, 10, 0] = 2.1  # within a tenth of the width
+    values[1, 10, 0] = 2.3
+    values[2, 10, 1] = np.nan
+    values[2, 20:, 1] = -1.5
+    outside = errors_with(0.5).outside(values, rate=10.0)
+    assert not outside[0].any()
+    np.testing.assert_array_equal(np.flatnonzero(outside[1]), np.arange(10, 16))
+    np.testing.assert_array_equal(np.flatnonzero(outside[2]), np.arange(20, 50))
+
+
+def test_excess_is_in_widths_of_the_range_and_of_a_constant_in_its_size() -> None:
+    calibration = np.array([[[0.0, 4.0, np.nan], [2.0, 4.0, np.nan]]])
+    low, high = value_range(calibration)
+    np.testing.assert_array_equal([low, high], [[0.0, 4.0, 0.0], [2.0, 4.0, 0.0]])
+    further = np.array([[[3.0, 4.0, np.nan], [1.0, 5.0, np.nan], [1.0, 4.0, np.nan]]])
+    np.testing.assert_allclose(range_excess(further, low, high), [[0.5, 0.25, 0.0]])
+
+
+def test_saved_values_that_do_not_fit_are_refused() -> None:
+    values = errors_with(1.0).values
+    again = ForecastErrors.of(values)
+    assert again is not None
+    assert again.values == values
+    with pytest.raises(rt.InputError, match="ranges from low to high"):
+        ForecastErrors.of(values | {"low": [5.0, 5.0]})
