@@ -381,8 +381,10 @@ def test_alarms_are_explained_beside_the_stream_and_after_a_restart(store: Store
         live.submit([samples(made[:210])])
         explanations.wait()
     live.submit([samples(made[210:], 210)])
-    (cause,) = [entry.data for entry in store.log("cause")]
+    cause, *further = [entry.data for entry in store.log("cause")]
     assert cause == reported[0]
+    assert not cause["same"]
+    assert all(each["same"] for each in further)  # of the event that the leak has opened
     assert (cause["name"], cause["alarm"]) == (
         "drain changed",
         next(iter(store.log("alarm"))).sequence,

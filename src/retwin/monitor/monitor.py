@@ -36,7 +36,7 @@ from retwin.monitor.validity import Validity
 from retwin.monitor.watched import Alarm, Ending, Watched
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.online import OnlineFilter
-from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.twin import BEYOND, DynamicsTwin
 
 SIZE = 256
 """Samples that are predicted at once: those after an alarm are predicted again. While an event
@@ -365,8 +365,11 @@ class Monitor:
         return known
 
     def _outside(self, commands: NDArray) -> NDArray:
-        """Whether commands (n, T, d_u) leave their range in calibration, (n, T)."""
+        """Whether commands (n, T, d_u) leave their range in both calibrations, (n, T)."""
         low, high = (each[len(self.twin.process) :] for each in self.twin.bounds)
+        least, largest = (each[: len(low)] for each in (self.noise.low, self.noise.high))
+        margin = BEYOND * (largest - least)
+        low, high = np.minimum(low, least - margin), np.maximum(high, largest + margin)
         return np.asarray(((commands < low) | (commands > high)).any(axis=2))
 
     @cached_property

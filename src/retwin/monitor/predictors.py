@@ -111,7 +111,8 @@ def settled(online: OnlineFilter, count: int, given: tuple[NDArray, ...]) -> int
         online.step(each, *given)[2] for each in (start, replace(start, spread=start.spread / 4))
     )
     ratio = np.diagonal(own / other, axis1=2, axis2=3)
-    differs = (np.abs(np.log(ratio)) > 2 * np.log(SETTLED)).any(axis=(0, 2))
+    # Where nothing is measured, as after the end of a shorter record, nothing is known better.
+    differs = ((np.abs(np.log(ratio)) > 2 * np.log(SETTLED)) & given[2]).any(axis=(0, 2))
     differs = differs[: own.shape[1] // 2]
     return int(np.flatnonzero(differs)[-1]) + 1 if differs.any() else 0
 
