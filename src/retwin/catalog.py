@@ -303,14 +303,14 @@ SOURCES: Mapping[str, SourceEntry] = {
         "Identified twin (least squares)",
         "healthy",
         (_LEAST_SQUARES,),
-        twin=_BY + "least_squares_twin",
+        twin=_BY + "updated",
         parametric=True,
     ),
     "pi_bayes": SourceEntry(
         "Identified twin (Bayesian)",
         "healthy",
         (_BAYES,),
-        twin=_BY + "posterior_twin",
+        twin=_BY + "updated",
         parametric=True,
         extra="bayes",
     ),
@@ -347,18 +347,18 @@ SOURCES: Mapping[str, SourceEntry] = {
         simulates=True,
     ),
     "dynamics": SourceEntry(
-        "Updated twin (dynamics)", "healthy", (_DYNAMICS,), twin=_BY + "corrected_dynamics"
+        "Updated twin (dynamics)", "healthy", (_DYNAMICS,), twin=_BY + "updated"
     ),
     "fit": SourceEntry(
         "Updated twin (chosen by its calibration)",
         "healthy",
         (("update", "fit"),),
-        twin=_BY + "chosen",
+        twin=_BY + "updated",
         simulates=True,
     ),
     **{
         name: SourceEntry(
-            title, "healthy", (("update", name),), twin=_BY + "black_box", simulates=True
+            title, "healthy", (("update", name),), twin=_BY + "updated", simulates=True
         )
         for name, title in (
             ("arx", "Linear model (ARX)"),

@@ -86,9 +86,7 @@ def compiled(source: str, *, contract: bool = False, quiet: bool = False) -> cty
     for command, native in product(compilers(), ([NATIVE], [])):
         try:
             return _library(source, (*command, *flags, *native))
-        except subprocess.CalledProcessError as error:
-            reasons.append(f"{command[0]}: {(error.stderr or 'failed').strip().splitlines()[0]}")
-        except (OSError, subprocess.TimeoutExpired) as error:
+        except OSError as error:
             reasons.append(f"{command[0]}: {error}")
     if not quiet:
         warnings.warn(
@@ -97,6 +95,17 @@ def compiled(source: str, *, contract: bool = False, quiet: bool = False) -> cty
             stacklevel=2,
         )
     return None
+
+
+def build(command: Sequence[str], source: Path, library: Path) -> None:
+    """Compile a file with a compiler and its flags; an OSError says why it fails."""
+    given = [*command, str(source), "-o", str(library), "-lm"]
+    try:
+        subprocess.run(given, check=True, capture_output=True, timeout=TIMEOUT, text=True)
+    except subprocess.CalledProcessError as error:
+        raise OSError((error.stderr or "failed").strip().splitlines()[0]) from None
+    except subprocess.TimeoutExpired as error:
+        raise OSError(error) from None
 
 
 def _library(source: str, command: tuple[str, ...]) -> ctypes.CDLL:
@@ -110,13 +119,7 @@ def _library(source: str, command: tuple[str, ...]) -> ctypes.CDLL:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         file, library = Path(folder, "model.c"), Path(folder, "model.so")
         file.write_text(source, "utf-8")
-        subprocess.run(
-            [*command, str(file), "-o", str(library), "-lm"],
-            check=True,
-            capture_output=True,
-            timeout=TIMEOUT,
-            text=True,
-        )
+        build(command, file, library)
         loaded = ctypes.CDLL(str(library))
         if kept is not None:
             with suppress(OSError):  # a cache that cannot be written is no reason to fail

@@ -16,7 +16,7 @@ from retwin.diagnosis.features import Features, class_index, class_names, class_
 from retwin.nets.networks import Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.serialisation.configs import from_config, to_config
-from retwin.serialisation.models import read_model, write_model
+from retwin.serialisation.models import read_model, save_model
 
 TRAJECTORIES_PER_BATCH = 256
 """Trajectories that are classified together: activations of more would leave the cache."""
@@ -74,8 +74,7 @@ class NetworkDiagnoser(nn.Module):
             **self.features.about(),
             "fitted": None if self.fitted is None else asdict(self.fitted),
         }
-        with write_model(folder, "diagnoser", about, self.state_dict()):
-            pass
+        save_model(folder, "diagnoser", about, self.state_dict())
 
     @classmethod
     def load(cls, folder: str | Path) -> NetworkDiagnoser:

@@ -26,7 +26,7 @@ from retwin.diagnosis.diagnoser import TrainingTask
 from retwin.diagnosis.features import Features, class_index, class_names, class_order
 from retwin.nets.networks import Standardise
 from retwin.nets.training import Fit
-from retwin.serialisation.models import read_model, write_model
+from retwin.serialisation.models import read_model, save_model
 
 PATTERNS = 84
 """Kernels of MiniRocket without their dilations; it uses each of them equally often."""
@@ -187,8 +187,7 @@ class RocketDiagnoser:
         """Write weights and description, see `retwin.serialisation.models`."""
         about = {"classes": self.classes, **self.features.about(), "samples": self.samples}
         about["figures"] = self.figures
-        with write_model(folder, "rocket", about, self.weights):
-            pass
+        save_model(folder, "rocket", about, self.weights)
 
     @classmethod
     def load(cls, folder: str | Path) -> RocketDiagnoser:

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import torch
 from numpy.typing import NDArray
 from scipy.stats import qmc
 from torch import Tensor, nn
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution
 
 from retwin.checks import needs_extra
+from retwin.nets.mixtures import Block
 
 if TYPE_CHECKING:
     from zuko.distributions import NormalizingFlow
 
 
-class FlowDistribution(Distribution):
+class FlowDistribution(Block):
     """A normalising flow in physical units.
 
     Parameters
@@ -31,9 +32,6 @@ class FlowDistribution(Distribution):
         (..., D), standard deviation of the noise that the flow transforms.
 
     """
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    support = constraints.real_vector
 
     def __init__(
         self, flow: NormalizingFlow, shift: Tensor, scale: Tensor, wider: Tensor | float = 1.0

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -29,7 +30,26 @@ PIT_RANGE = (1e-4, 1 - 1e-4)
 3.7 standard deviations."""
 
 
-class GaussianMixture(MixtureSameFamily):
+class Block(Distribution):
+    """A distribution that `Blocks` can join: one of torch's with three methods more."""
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+    support: Any = constraints.real_vector
+
+    @abstractmethod
+    def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
+        """Draws by uniform (*batch) and normal (*batch, width) noise."""
+
+    @abstractmethod
+    def normal_scores(self, value: Tensor) -> Tensor:
+        """Standard Gaussian scores of values (*batch, width) within their distribution."""
+
+    @abstractmethod
+    def widened(self, factor: Tensor) -> Block:
+        """The distributions with deviations from the mean times `factor` (width,)."""
+
+
+class GaussianMixture(MixtureSameFamily, Block):
     """A mixture of K multivariate normals with full covariance (Eq. 6).
 
     Parameters
@@ -109,7 +129,7 @@ class GaussianMixture(MixtureSameFamily):
         return torch.special.ndtri(self.marginal_cdf(value).clamp(*PIT_RANGE))
 
 
-class Bernoullis(Distribution):
+class Bernoullis(Block):
     """The distribution of D independent events, each 0 or 1.
 
     Parameters
@@ -119,7 +139,6 @@ class Bernoullis(Distribution):
 
     """
 
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     support = constraints.boolean
 
     def __init__(self, logits: Tensor) -> None:
@@ -162,42 +181,7 @@ class Bernoullis(Distribution):
         return self
 
 
-class Block(Protocol):
-    """A distribution that `Blocks` can join: torch's interface, `from_noise`, `normal_scores`."""
-
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Shape of a batch of distributions."""
-
-    @property
-    def event_shape(self) -> torch.Size:
-        """Shape of a value, (width,)."""
-
-    @property
-    def mean(self) -> Tensor:
-        """Means (*batch, width)."""
-
-    @property
-    def variance(self) -> Tensor:
-        """Variances (*batch, width)."""
-
-    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Block:
-        """The same distributions for a larger batch."""
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        """Logarithm of the density of values (*batch, width)."""
-
-    def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
-        """Draws by uniform (*batch) and normal (*batch, width) noise."""
-
-    def normal_scores(self, value: Tensor) -> Tensor:
-        """Standard Gaussian scores of values (*batch, width) within their distribution."""
-
-    def widened(self, factor: Tensor) -> Block:
-        """The distributions with deviations from the mean times `factor` (width,)."""
-
-
-class Blocks(Distribution):
+class Blocks(Block):
     """The joint distribution of independent blocks of z, (..., D).
 
     Parameters
@@ -206,9 +190,6 @@ class Blocks(Distribution):
         One distribution for each block of components, with the same batch shape.
 
     """
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    support = constraints.real_vector
 
     def __init__(self, blocks: Sequence[Block]) -> None:
         self.blocks = list(blocks)

@@ -56,13 +56,10 @@ class Standardise(nn.Module):
 
     """
 
-    mean: Tensor
-    scale: Tensor
-
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(channels))
-        self.register_buffer("scale", torch.ones(channels))
+        self.mean = nn.Buffer(torch.zeros(channels))
+        self.scale = nn.Buffer(torch.ones(channels))
 
     def fit(self, values: Tensor) -> Standardise:
         """Take mean and standard deviation of `values` (..., channels), in double precision."""

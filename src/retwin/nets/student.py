@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import ClassVar
 
 import numpy as np
 import torch
 from scipy import stats
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution
 
 from retwin.nets.mixtures import PIT_RANGE, Block
 
@@ -20,7 +19,7 @@ Student's t within 0.5 %, 99 % intervals within 6 %, from one degree of freedom 
 factor, the quantile at 127/128, bounds what draws are: 102 for one degree, 3.9 for four."""
 
 
-class Student(Distribution):
+class Student(Block):
     """A block whose deviations have an unknown common factor.
 
     A variance that is estimated with ν degrees of freedom is, relative to the true one, distributed
@@ -36,9 +35,6 @@ class Student(Distribution):
 
     """
 
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    support = constraints.real_vector
-
     def __init__(self, block: Block, degrees: float) -> None:
         self.block = block
         self.degrees = degrees
@@ -46,7 +42,7 @@ class Student(Distribution):
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> Student:
         """The same distribution for a larger batch."""
-        return Student(self.block.expand(batch_shape), self.degrees)
+        return Student(self.block.expand(torch.Size(batch_shape)), self.degrees)
 
     @property
     def mean(self) -> Tensor:

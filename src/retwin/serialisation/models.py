@@ -61,6 +61,14 @@ def write_model(
         yield temporary
 
 
+def save_model(
+    folder: str | Path, kind: str, about: dict[str, Any], weights: dict[str, Tensor]
+) -> None:
+    """Write a model that has no further files, see `write_model`."""
+    with write_model(folder, kind, about, weights):
+        pass
+
+
 def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Description and weights of a model folder.
 

@@ -22,7 +22,7 @@ from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Report
 from retwin.results import Results
-from retwin.serialisation.files import sha256, write_atomically
+from retwin.serialisation.files import sha256, write_json
 from retwin.serialisation.identity import identity
 from retwin.serialisation.places import in_use
 from retwin.study.data import StudyData, real_data, twin_data
@@ -242,15 +242,12 @@ def _prepare(
     remedy = "give more of them, or a larger per_class"
     at_least("twin-data", twin, MIN_TRAJECTORIES, "trajectories of the twin", remedy=remedy)
     _check_classes(case, plan, twin)
-    with write_atomically(out / "study.json") as part:
-        text = json.dumps({"retwin": __version__, **found}, indent=1)
-        part.write_text(text, encoding="utf-8")
+    write_json(out / "study.json", {"retwin": __version__, **found})
     save(real, out / "work" / "real.npz")
     # A set that may not fit into memory stays in Zarr, which is read in chunks.
     large = data.twin is not None and (data.twin / "zarr.json").exists()
     save(twin, out / "work" / ("twin.zarr" if large else "twin.npz"))
-    with write_atomically(out / "work" / "roles.json") as part:
-        part.write_text(json.dumps(roles.folds), encoding="utf-8")
+    write_json(out / "work" / "roles.json", roles.folds)
 
 
 def _about(

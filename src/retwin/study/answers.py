@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,11 @@ RESAMPLINGS = 10_000
 """Bootstrap draws, as docs/theory.md states."""
 
 
-class Answers(Protocol):
-    """Scores of every source, for each run and for each bootstrap draw of the test set.
+@dataclass(frozen=True)
+class Diagnoses:
+    """Class probabilities of the test trajectories.
+
+    In `arrays.npz` they are `probabilities/SOURCE` (runs, n, classes).
 
     Attributes
     ----------
@@ -41,39 +44,6 @@ class Answers(Protocol):
     records : int or None
         Test records of a case without classes.
 
-    """
-
-    compared: ClassVar[tuple[str, ...]]
-    family: ClassVar[tuple[str, ...]]
-    curved: ClassVar[tuple[str, ...]]
-
-    @property
-    def records(self) -> int | None:
-        """See `Answers`."""
-
-    def scores(self, source: str, healthy: int = 0) -> dict[str, list[float]]:
-        """Each score of a source, with one value per run; `healthy` as in `Job`."""
-
-    def drawn(self, source: str, healthy: int = 0) -> dict[str, Draws]:
-        """Draws of each compared score's mean over runs; paired between sources."""
-
-    def details(self, source: str) -> dict[str, Any]:
-        """Other entries of a source in `results.json`."""
-
-    def arrays(self) -> dict[str, NDArray]:
-        """Arrays for `arrays.npz`."""
-
-
-def answers(work: Work) -> Answers:
-    """The answers of a study: diagnoses, or simulations where the case has no classes."""
-    return Diagnoses(work) if work.case.diagnosed else SimulatedRecords(work)
-
-
-@dataclass(frozen=True)
-class Diagnoses:
-    """Class probabilities of the test trajectories.
-
-    In `arrays.npz` they are `probabilities/SOURCE` (runs, n, classes).
     """
 
     work: Work
@@ -97,7 +67,7 @@ class Diagnoses:
 
     @property
     def records(self) -> int | None:
-        """See `Answers`."""
+        """None: all trajectories have classes."""
         return None
 
     def _probabilities(self, source: str, healthy: int = 0) -> NDArray:
@@ -113,18 +83,21 @@ class Diagnoses:
         return out
 
     def scores(self, source: str, healthy: int = 0) -> dict[str, list[float]]:
-        """See `Answers.scores`."""
+        """Each score of a source, with one value per run; `healthy` as in `Job`."""
         classes = self.work.case.classes
         runs = [score(self._truth, run, classes) for run in self._probabilities(source, healthy)]
         return {metric: [getattr(each, metric) for each in runs] for metric in METRICS}
 
     def drawn(self, source: str, healthy: int = 0) -> dict[str, Draws]:
-        """See `Answers.drawn`."""
+        """Draws of each compared score's mean over runs; paired between sources."""
         runs = self._probabilities(source, healthy)
         return {metric: self._resampling.of(metric, runs) for metric in self.compared}
 
     def details(self, source: str) -> dict[str, Any]:
-        """Confusion counts, rows true, summed over runs; and the predicted class indices."""
+        """Other entries in `results.json`.
+
+        Confusion counts, rows true, summed over runs; and the predicted class indices.
+        """
         predicted = self._probabilities(source).argmax(axis=2)
         classes = len(self.work.case.classes)
         counts = np.sum([confusion(self._truth, run, classes) for run in predicted], axis=0)
@@ -135,7 +108,7 @@ class Diagnoses:
         }
 
     def arrays(self) -> dict[str, NDArray]:
-        """See `Answers.arrays`."""
+        """Arrays for `arrays.npz`."""
         names = self.work.plan.sources
         return {f"probabilities/{name}": self._probabilities(name) for name in names}
 
@@ -168,7 +141,7 @@ class SimulatedRecords:
 
     @property
     def records(self) -> int | None:
-        """See `Answers`."""
+        """See `Diagnoses`."""
         return len(self._records)
 
     def _runs(self, source: str, healthy: int = 0) -> list[Simulation]:
@@ -181,13 +154,13 @@ class SimulatedRecords:
         return found
 
     def scores(self, source: str, healthy: int = 0) -> dict[str, list[float]]:
-        """See `Answers.scores`."""
+        """See `Diagnoses.scores`."""
         means = [record_means(each.per_sample()) for each in self._runs(source, healthy)]
         runs = [simulation_scores(each, self._records) for each in means]
         return {name: [float(run[name]) for run in runs] for name in runs[0]}
 
     def drawn(self, source: str, healthy: int = 0) -> dict[str, Draws]:
-        """See `Answers.drawn`."""
+        """See `Diagnoses.drawn`."""
         seed = self.work.plan.seed_of("bootstrap", 0)
         runs = []
         for each in self._runs(source, healthy):
@@ -204,7 +177,7 @@ class SimulatedRecords:
         return {}
 
     def arrays(self) -> dict[str, NDArray]:
-        """See `Answers.arrays`."""
+        """See `Diagnoses.arrays`."""
         found = {
             "commands": self._records.commands,
             "nominal": self._records.nominal,
@@ -257,3 +230,12 @@ class SimulatedRecords:
         known = {each.name: float(each.start or 0.0) for each in free} | given
         arrays |= read_estimates(folder, known, units)
         return {f"delta/{name}": each for name, each in arrays.items()}
+
+
+Answers: TypeAlias = Diagnoses | SimulatedRecords
+"""Scores of every source, for each run and for each bootstrap draw of the test set."""
+
+
+def answers(work: Work) -> Answers:
+    """The answers of a study: diagnoses, or simulations where the case has no classes."""
+    return Diagnoses(work) if work.case.diagnosed else SimulatedRecords(work)

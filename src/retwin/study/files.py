@@ -10,7 +10,7 @@ from typing import Any
 
 from retwin.data.io import load
 from retwin.data.trajectories import Trajectories
-from retwin.serialisation.files import write_atomically
+from retwin.serialisation.files import write_json
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,7 @@ class Files:
 
     def keep_costs(self, job: Job, costs: Mapping[str, Any]) -> None:
         """Write the costs of a job beside its result."""
-        with write_atomically(self._costs(job)) as part:
-            part.write_text(json.dumps(costs), encoding="utf-8")
+        write_json(self._costs(job), costs)
 
     def _costs(self, job: Job) -> Path:
         path = self.path(job)

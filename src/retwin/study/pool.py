@@ -16,7 +16,7 @@ from graphlib import TopologicalSorter
 from typing import Any
 
 from retwin.checks import require
-from retwin.study.files import Job
+from retwin.study.files import Job, Roles
 from retwin.study.progress import Stages
 from retwin.study.work import Work
 from retwin.workers.jobs import on_cluster
@@ -132,7 +132,7 @@ def _do_on_cluster(work: Work, job: Job) -> None:
     roles = work.folder / "roles.json"
     seen = roles.read_text("utf-8") if roles.exists() else "no such file"
     require(
-        seen == json.dumps(work.roles.folds),
+        roles.exists() and Roles.of(json.loads(seen)) == work.roles,
         "out",
         expected="a folder that all workers see at the same path",
         got=f"{roles}, of which {platform.node()} sees {'another one' if roles.exists() else seen}",

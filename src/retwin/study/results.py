@@ -371,10 +371,8 @@ def _poses(work: Work, test: Trajectories, overlay: Overlay | None = None) -> di
 
 def _machine() -> dict[str, str]:
     return {
-        "retwin": version("retwin"),
+        **{name: version(name) for name in ("retwin", "torch", "numpy")},
         "python": platform.python_version(),
-        "torch": version("torch"),
-        "numpy": version("numpy"),
         "machine": platform.platform(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }

@@ -7,6 +7,7 @@ case has classes, else simulations of the test records.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.util import find_spec
 
 from retwin.cases.case import Case
@@ -51,29 +52,10 @@ def noisy_surrogate(trial: Trial) -> Twin:
     return NoisyTwin(trial.surrogate(), scale, sensor_rate=rate, emulated=healthy.emulated)
 
 
-def least_squares_twin(trial: Trial) -> Twin:
-    """The twin with its parameters identified by least squares (Eq. 2)."""
-    return trial.updated("pi_ls")
-
-
-def posterior_twin(trial: Trial) -> Twin:
-    """The twin with parameters drawn from their posterior (Eq. 3)."""
-    return trial.updated("pi_bayes")
-
-
-def corrected_dynamics(trial: Trial) -> Twin:
-    """The twin with a learned discrepancy inside its state equations."""
-    return trial.updated("dynamics")
-
-
-def chosen(trial: Trial) -> Twin:
-    """The twin with the correction that predicts left-out parts of the calibration set best."""
-    return trial.updated("fit")
-
-
-def black_box(trial: Trial) -> Twin:
-    """A model of the measured outputs by the commands, without the twin."""
-    return trial.updated(trial.job.name)
+def updated(trial: Trial) -> Twin:
+    """The twin, or the model without it, that the update of this source has made."""
+    ((_, method),) = SOURCES[trial.job.name].needs
+    return trial.updated(method)
 
 
 def adversarial(trial: Trial) -> FittedDiagnoser:
@@ -94,10 +76,10 @@ def _adversarial(trial: Trial, target: Trajectories) -> FittedDiagnoser:
 
 def mean_corrected(trial: Trial) -> Twin:
     """The corrected twin with the mean of the RG instead of samples (Eq. 8)."""
-    return CorrectedTwin(trial.surrogate(), trial.residual("output"), random=False)
+    return replace(output_corrected(trial), random=False)
 
 
-def output_corrected(trial: Trial) -> Twin:
+def output_corrected(trial: Trial) -> CorrectedTwin:
     """The corrected twin of the paper: delay and offset of the outputs."""
     return CorrectedTwin(trial.surrogate(), trial.residual("output"))
 
@@ -130,9 +112,9 @@ def inversion(trial: Trial) -> FittedDiagnoser:
 
 def inversion_dynamics(trial: Trial) -> FittedDiagnoser:
     """The inversion of faults by the filter of the corrected dynamics."""
-    updated = trial.updated("dynamics")
-    assert isinstance(updated, DynamicsTwin), "that is what the update makes"
-    return fit_inversion(updated, None, None, trial.case.faults)
+    twin = trial.updated("dynamics")
+    assert isinstance(twin, DynamicsTwin), "that is what the update makes"
+    return fit_inversion(twin, None, None, trial.case.faults)
 
 
 def lacking(name: str, case: Case, plan: StudyPlan) -> str:

@@ -33,7 +33,7 @@ from retwin.evaluation.fidelity import (
 )
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
-from retwin.serialisation.models import write_model
+from retwin.serialisation.models import save_model
 from retwin.study.estimates import write_estimates
 from retwin.study.files import Files, Job, Roles
 from retwin.study.plan import StudyPlan
@@ -275,7 +275,7 @@ class Work:
         source, costs = SOURCES[trial.job.name], {}
         started = time.perf_counter()
         if source.twin:
-            made = trial.generate(resolve(source.twin)(trial))
+            made = trial.generate(_source_twin(trial))
             costs = {"generate": time.perf_counter() - started, "trajectories": len(made)}
             if not source.needs or source.parametric:
                 costs["twin_runs"] = len(made)
@@ -295,8 +295,7 @@ class Work:
 
     def _simulation(self, trial: Trial, path: Path) -> Costs:
         """Simulate the test records from their commands alone, with scores of each sample."""
-        make = resolve(SOURCES[trial.job.name].twin)
-        twin, records = make(trial), self.files.real_data()[list(trial.fold[1])]
+        twin, records = _source_twin(trial), self.files.real_data()[list(trial.fold[1])]
         started = time.perf_counter()
         seed = trial.seed("simulate")
         simulate_records(twin, records, draws=DRAWS, seed=seed, progress=trial.progress).save(path)
@@ -311,8 +310,7 @@ class Work:
             with write_atomically(path) as part:
                 np.savez(part)  # an empty file marks the job as done
             return {}
-        make = resolve(SOURCES[trial.job.name].twin)
-        twin = make(trial)
+        twin = _source_twin(trial)
         rivals: dict[str, Twin] = {}
         widening = None
         corrected = any(kind == "residual" for kind, _ in SOURCES[trial.job.name].needs)
@@ -332,8 +330,7 @@ class Work:
 
     def _overlay(self, trial: Trial, path: Path) -> Costs:
         """The predictive overlay of the fold's test trajectories, for display and no score."""
-        make = resolve(SOURCES[trial.job.name].twin)
-        twin, test = make(trial), self.files.real_data()[list(trial.fold[1])]
+        twin, test = _source_twin(trial), self.files.real_data()[list(trial.fold[1])]
         assert isinstance(twin, CorrectedTwin), 'as all whose role is "updated"'
         seed, rate = trial.seed("portrait"), self.case.sensor_rate
         predictive_overlay(twin, test, seed=seed, rate=rate, progress=trial.progress).save(path)
@@ -403,8 +400,7 @@ class Work:
 
 def _least_squares(trial: Trial, path: Path) -> Updated:
     found = identify(trial.parametric, trial.healthy, **trial.updating)
-    with write_model(path, "parameters", {"values": found.values}, {}):
-        pass
+    save_model(path, "parameters", {"values": found.values}, {})
     return found
 
 
@@ -412,3 +408,8 @@ def _bayes(trial: Trial, path: Path) -> Posterior:
     found = identify(trial.parametric, trial.healthy, NPE(), **trial.updating)
     found.twin.save(path)
     return found
+
+
+def _source_twin(trial: Trial) -> Any:
+    """The twin of the job's source."""
+    return resolve(SOURCES[trial.job.name].twin)(trial)

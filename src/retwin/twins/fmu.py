@@ -362,20 +362,14 @@ class FMUTwin:
 
     def _check_loads(self, pool: IsolatedPool) -> None:
         """Refuse an FMU that cannot be loaded, once instead of in every run."""
-        remedy = "export it for this system; see that what it needs is installed"
-        try:
-            task = f"{TASKS}:load"
-            reason = pool.schedule(task, None, timeout=self.timeout, size=0).result()[0]
-        except TimeoutError:
-            reason = f"it hung for more than {self.timeout:g} s"
-        except ProcessEnded as error:
-            reason = str(error)
+        loading = pool.schedule(f"{TASKS}:load", None, timeout=self.timeout, size=0)
+        reason = self._outcome(loading).reason
         require(
             not reason,
             "path",
             expected="an FMU that loads on this machine",
             got=f"{self.path.name}: {reason}",
-            remedy=remedy,
+            remedy="export it for this system; see that what it needs is installed",
         )
 
     def _start_values(

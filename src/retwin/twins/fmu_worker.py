@@ -29,8 +29,8 @@ def start(job: dict[str, Any]) -> Iterator[Frame]:
 
 
 def load(_: None) -> Iterator[Frame]:
-    """Load the FMU; yields the reason why it cannot be loaded, "" when it is loaded."""
-    yield _load(), []
+    """Load the FMU; yields an `Outcome` with the reason why it cannot be loaded."""
+    yield _frame(Outcome(reason=_load()))
 
 
 def _load() -> str:
@@ -47,5 +47,9 @@ def run(values: Start, commands: NDArray) -> Iterator[Frame]:
     """Run the FMU once, on commands (T, d_u) with start values; yields an `Outcome`."""
     reason = _load()
     outcome = Outcome(reason=reason) if _instance is None else _instance.run(commands, values)
+    yield _frame(outcome)
+
+
+def _frame(outcome: Outcome) -> Frame:
     about = asdict(outcome)
-    yield about, [about.pop("outputs")]
+    return about, [about.pop("outputs")]

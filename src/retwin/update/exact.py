@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from retwin import catalog
 from retwin.checks import given, require
 from retwin.progress import Progress
-from retwin.serialisation.models import kind_of, read_about, refusing, write_model
+from retwin.serialisation.models import kind_of, read_about, refusing, save_model
 from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state import State
@@ -106,8 +106,7 @@ class ExactSurrogate(OfTwin):
             about["case"] = case
             if isinstance(self.twin, ParametricTwin):
                 about["values"] = dict(zip(self.twin.names, self.twin.values, strict=True))
-        with write_model(folder, KIND, about, {}):
-            pass
+        save_model(folder, KIND, about, {})
 
     @classmethod
     def load(cls, folder: str | Path, twin: Twin | None = None) -> ExactSurrogate:

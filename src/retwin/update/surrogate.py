@@ -20,7 +20,7 @@ from retwin.nets.networks import MLP, Network, Standardise, last_layers
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
-from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.serialisation.models import read_model, refusing, save_model
 from retwin.times import sample_rate
 from retwin.twins.command_range import CommandRange
 from retwin.twins.faults import Fault
@@ -181,8 +181,7 @@ class Surrogate(nn.Module):
             "fitted": None if self.fitted is None else asdict(self.fitted),
             "trained": None if self.trained is None else asdict(self.trained),
         }
-        with write_model(folder, "surrogate", about, self.state_dict()):
-            pass
+        save_model(folder, "surrogate", about, self.state_dict())
 
     @classmethod
     def load(cls, folder: str | Path) -> Surrogate:

@@ -210,7 +210,7 @@ def test_the_sensor_records_as_the_operator_does(bundle: Bundle) -> None:
     level = torch.rand(shape, generator=generator, dtype=torch.float64).float()
     glitch_level = torch.rand(shape[:2], generator=generator)[..., None]
     glitch_noise = torch.randn(shape, generator=generator)
-    made = SensorGraph(sensor, 3, rate)(outputs, phase, level, glitch_level, glitch_noise)
+    made = SensorGraph(sensor, rate)(outputs, phase, level, glitch_level, glitch_noise)
     torch.testing.assert_close(made, expected, atol=2e-5, rtol=0)
 
 

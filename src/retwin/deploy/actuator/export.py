@@ -8,7 +8,7 @@ import warnings
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from retwin.checks import positive, require, whole
 from retwin.data.trajectories import Channels
 from retwin.deploy.actuator.draws import Draws, causal_part, drawn, still_and_fastest
 from retwin.deploy.actuator.module import AT_REST, Actuators, ActuatorStep
-from retwin.nets.networks import Standardise
 from retwin.serialisation.models import write_model
 from retwin.serialisation.places import check_place
 from retwin.twins.twin import checked_commands, checked_seed
@@ -49,8 +48,6 @@ INPUTS = (
 )
 """Inputs of the ONNX graph, the state last."""
 STATE = INPUTS[5:]
-PARTS = ("before", "network", "after")
-"""Modules of a surrogate in series."""
 
 
 @dataclass(frozen=True)
@@ -185,9 +182,7 @@ def _actuators(
     plant: nn.Module = nn.Identity()
     if at_outputs:
         assert isinstance(twin.surrogate, Surrogate)
-        before, network, after = (getattr(twin.surrogate, each) for each in PARTS)
-        network = copy.deepcopy(network).requires_grad_(False)
-        plant = nn.Sequential(Standard(before, False), network, Standard(after, True))
+        plant = ScriptedNetwork(twin.surrogate)
     step = ActuatorStep(
         plant,
         gain=found.gain,
@@ -204,22 +199,18 @@ def _actuators(
     return Actuators(step, delay, found.offset, found.probability, length).eval()
 
 
-class Standard(nn.Module):
-    """To standard units of a standardisation, or back: torch.jit cannot read that of `nets`."""
+class ScriptedNetwork(nn.Module):
+    """The network of a surrogate with its units: torch.jit cannot read the surrogate itself."""
 
-    if TYPE_CHECKING:  # torch.jit reads no annotations of a class
-        mean: Tensor
-        scale: Tensor
-
-    def __init__(self, units: Standardise, back: bool) -> None:
+    def __init__(self, surrogate: Surrogate) -> None:
         super().__init__()
-        self.back = back
-        self.register_buffer("mean", units.mean.clone())
-        self.register_buffer("scale", units.scale.clone())
+        self.before = copy.deepcopy(surrogate.before)
+        self.network = copy.deepcopy(surrogate.network).requires_grad_(False)
+        self.after = copy.deepcopy(surrogate.after)
 
     def forward(self, values: Tensor) -> Tensor:
-        """Values (..., d) in the other units."""
-        return values * self.scale + self.mean if self.back else (values - self.mean) / self.scale
+        """Outputs (..., d_y) for inputs (..., d_u)."""
+        return self.after.inverse(self.network(self.before(values)))
 
 
 def _examples(actuators: Actuators, commands: NDArray) -> tuple[Tensor, Tensor, Tensor]:

@@ -9,8 +9,6 @@ actuator changes the error in proportion to the command, which T_z interpolates 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor, nn
 
@@ -37,14 +35,6 @@ class ActuatorStep(nn.Module):
 
     """
 
-    if TYPE_CHECKING:  # torch.jit reads no annotations of a class
-        gain: Tensor
-        centre: Tensor
-        low: Tensor
-        high: Tensor
-        tolerance: Tensor
-        speed: Tensor
-
     def __init__(
         self,
         plant: nn.Module,
@@ -60,9 +50,12 @@ class ActuatorStep(nn.Module):
         super().__init__()
         self.plant = plant
         self.rest = rest
-        numbers = {"gain": gain, "centre": centre, "low": low, "high": high}
-        for name, values in (numbers | {"tolerance": tolerance, "speed": speed}).items():
-            self.register_buffer(name, values)
+        self.gain = nn.Buffer(gain)
+        self.centre = nn.Buffer(centre)
+        self.low = nn.Buffer(low)
+        self.high = nn.Buffer(high)
+        self.tolerance = nn.Buffer(tolerance)
+        self.speed = nn.Buffer(speed)
 
     def forward(
         self,
@@ -148,19 +141,6 @@ class Actuators(nn.Module):
 
     """
 
-    if TYPE_CHECKING:  # torch.jit reads no annotations of a class
-        delays: Tensor
-        offsets: Tensor
-        probabilities: Tensor
-        delay: Tensor
-        offset: Tensor
-        probability: Tensor
-        previous: Tensor
-        reference: Tensor
-        resting: Tensor
-        missed: Tensor
-        history: Tensor
-
     def __init__(
         self,
         step: ActuatorStep,
@@ -173,20 +153,17 @@ class Actuators(nn.Module):
         self.step = step
         self.length = length
         self.at_rest = AT_REST
-        for name, values in (
-            ("delays", delays),
-            ("offsets", offsets),
-            ("probabilities", probabilities),
-            ("delay", delays[:0]),
-            ("offset", offsets[:0]),
-            ("probability", probabilities[:0]),
-            ("previous", probabilities[:0]),
-            ("reference", probabilities[:0]),
-            ("resting", delays[:0]),
-            ("missed", probabilities[:0]),
-            ("history", offsets.new_zeros(length, 0, offsets.shape[1])),
-        ):
-            self.register_buffer(name, values.clone())
+        self.delays = nn.Buffer(delays)
+        self.offsets = nn.Buffer(offsets)
+        self.probabilities = nn.Buffer(probabilities)
+        self.delay: Tensor = nn.Buffer(delays[:0].clone())
+        self.offset: Tensor = nn.Buffer(offsets[:0].clone())
+        self.probability: Tensor = nn.Buffer(probabilities[:0].clone())
+        self.previous: Tensor = nn.Buffer(probabilities[:0].clone())
+        self.reference: Tensor = nn.Buffer(probabilities[:0].clone())
+        self.resting: Tensor = nn.Buffer(delays[:0].clone())
+        self.missed: Tensor = nn.Buffer(probabilities[:0].clone())
+        self.history: Tensor = nn.Buffer(offsets.new_zeros(length, 0, offsets.shape[1]))
 
     @torch.jit.export
     def draws(self) -> int:

@@ -8,19 +8,18 @@ corrected twin, in which torque, position and commanded position are known at ea
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from retwin.checks import finite, require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.deploy.actuator.export import PARITY, PARTS, Standard, write_script
-from retwin.errors import InputError
+from retwin.deploy.actuator.export import PARITY, ScriptedNetwork, write_script
 from retwin.nets.networks import MLP
 from retwin.nets.training import Training
 from retwin.progress import Progress
@@ -170,26 +169,10 @@ def _history(history: Sequence[int]) -> tuple[int, ...]:
 
 def _places(twin: Twin, joint: Joint) -> tuple[int, int, int, int | None]:
     """Where target, position, torque and velocity are among commands and outputs."""
-    found: list[int | None] = []
-    for field in fields(joint):
-        name = getattr(joint, field.name)
-        channels = twin.inputs if field.name == "target" else twin.outputs
-        if field.name == "velocity" and not name:
-            found.append(None)
-            continue
-        if name not in channels.names:
-            raise InputError(
-                "joints",
-                expected=f"a {field.name} among {', '.join(channels.names)}",
-                got=f"{name!r}, which the twin has not",
-                remedy="an actuator net needs torques of the machine; without them, "
-                "export_actuator gives effective position targets, which need none",
-            )
-        found.append(channels.names.index(name))
-    target, position, torque, velocity = found
-    assert target is not None
-    assert position is not None
-    assert torque is not None
+    target = _place(twin.inputs, "target", joint.target)
+    position = _place(twin.outputs, "position", joint.position)
+    torque = _place(twin.outputs, "torque", joint.torque)
+    velocity = _place(twin.outputs, "velocity", joint.velocity) if joint.velocity else None
     commanded, reached = twin.inputs.units[target], twin.outputs.units[position]
     _require(
         commanded == reached,
@@ -199,6 +182,19 @@ def _places(twin: Twin, joint: Joint) -> tuple[int, int, int, int | None]:
         "convert one of them in the twin",
     )
     return target, position, torque, velocity
+
+
+def _place(channels: Channels, role: str, name: str) -> int:
+    """Where the channel is that has a role in a joint."""
+    _require(
+        name in channels.names,
+        "joints",
+        f"a {role} among {', '.join(channels.names)}",
+        f"{name!r}, which the twin has not",
+        "an actuator net needs torques of the machine; without them, export_actuator gives "
+        "effective position targets, which need none",
+    )
+    return channels.names.index(name)
 
 
 def _examples(
@@ -223,9 +219,7 @@ def _examples(
 
 def _write(network: Surrogate, path: Path, inputs: Tensor) -> None:
     """The network with its scales inside, read again and compared."""
-    before, inner, after = (getattr(network, each) for each in PARTS)
-    module = nn.Sequential(Standard(before, False), inner, Standard(after, True))
-    module = module.requires_grad_(False).eval()
+    module = ScriptedNetwork(network).eval()
     with write_atomically(path) as temporary:
         again: Any = write_script(module, Path(temporary))
         expected, found = module(inputs[:1000]), again(inputs[:1000])

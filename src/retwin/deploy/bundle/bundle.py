@@ -23,7 +23,7 @@ from retwin.deploy.bundle.seal import SCHEMAS, open_sealed, seal
 from retwin.deploy.bundle.verdicts import Prediction, present_diagnoser
 from retwin.diagnosis import FittedDiagnoser, conclude, load_diagnoser
 from retwin.progress import Progress
-from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.serialisation.models import read_model, refusing, save_model, write_model
 from retwin.update.corrected import CorrectedTwin, generate
 
 
@@ -190,10 +190,7 @@ class Bundle:
         }
         with write_model(folder, "bundle", about, {}) as inside:
             self.twin.save(inside / "twin")
-            with write_model(
-                inside / "guard", "guard", self.guard.about(), self.guard.state_dict()
-            ):
-                pass
+            save_model(inside / "guard", "guard", self.guard.about(), self.guard.state_dict())
             if self.diagnoser is not None:
                 self.diagnoser.save(inside / "diagnoser")
             seal(inside)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -14,7 +13,7 @@ from pathlib import Path
 from numpy.typing import NDArray
 
 from retwin.checks import ends_in, needs_extra, one_of
-from retwin.compiler import c_source, compilers
+from retwin.compiler import build, c_source, compilers
 from retwin.deploy.fmu.description import build_description, description, token_of
 from retwin.deploy.fmu.states import states_text
 from retwin.deploy.fmu.surrogates import surrogate_text
@@ -37,8 +36,6 @@ HEADERS = {
 }
 DATE = (1980, 1, 1, 0, 0, 0)
 """The date of the files in an FMU: the same twin gives the same bytes."""
-TIMEOUT = 120
-"""Seconds that the compiler may take."""
 
 
 @dataclass(frozen=True)
@@ -119,8 +116,9 @@ def export_fmu(
     identifier = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"twin_{identifier}"
     token = token_of(text.source + version)
-    interface = c_source(__package__, "interface.c", f"fmi{version[0]}.c")
-    source = "\n".join([text.source, f'#define TOKEN "{token}"', interface])
+    fmi = f"fmi{version[0]}"
+    head = f'#include "{fmi}Functions.h"\n#define TOKEN "{token}"\ntypedef {fmi}Boolean Boolean;'
+    source = "\n".join([text.source, head, c_source(__package__, "interface.c", f"{fmi}.c")])
     headers = Path(str(fmpy.__file__)).parent / "c-code"
     content: dict[str, bytes] = {
         "modelDescription.xml": description(
@@ -182,11 +180,10 @@ def _compiled(content: Mapping[str, bytes], identifier: str) -> bytes:
             file.write_bytes(data)
         source, library = Path(folder, "sources", f"{identifier}.c"), Path(folder, "library")
         for command in compilers():
-            given = [*command, *FLAGS, str(source), "-o", str(library), "-lm"]
             try:
-                subprocess.run(given, check=True, capture_output=True, timeout=TIMEOUT)
+                build((*command, *FLAGS), source, library)
                 return library.read_bytes()
-            except (OSError, subprocess.SubprocessError) as error:
+            except OSError as error:
                 reasons.append(f"{command[0]}: {brief(error)}")
     raise InputError(
         "compiled",

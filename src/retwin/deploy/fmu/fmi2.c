@@ -1,28 +1,18 @@
 /* The co-simulation interface of FMI 2.0 of a twin, which stands above this text with TOKEN. */
 
-#include <stdlib.h>
-#include "fmi2Functions.h"
-
 typedef struct {
     Twin twin;
     fmi2CallbackFunctions callbacks;
     char name[256];
 } Instance;
 
-static fmi2Status refused(Instance *of, const char *message)
+/* The status of a function, with a message where something is wrong. */
+static fmi2Status answer(Instance *of, const char *function, const char *wrong)
 {
-    if (of->callbacks.logger)
+    if (wrong && of->callbacks.logger)
         of->callbacks.logger(of->callbacks.componentEnvironment, of->name, fmi2Error, "logStatusError",
-                             "%s", message);
-    return fmi2Error;
-}
-
-/* A message at the first sample that is outside the range of training. */
-static void warn(Instance *of)
-{
-    if (of->twin.outside && !of->twin.warned++ && of->callbacks.logger)
-        of->callbacks.logger(of->callbacks.componentEnvironment, of->name, fmi2Warning,
-                             "logStatusWarning", "%s", LEFT);
+                             "%s: %s", function, wrong);
+    return wrong ? fmi2Error : fmi2OK;
 }
 
 const char *fmi2GetTypesPlatform(void)
@@ -97,108 +87,29 @@ fmi2Status fmi2Reset(fmi2Component c)
     return fmi2OK;
 }
 
-fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Real value[])
-{
-    Twin *twin = &((Instance *)c)->twin;
-    if (!twin->begun)
-        begin(twin), twin->begun = 0;
-    evaluate(twin);
-    for (size_t i = 0; i < n; i++) {
-        if (vr[i] >= NV)
-            return refused(c, "fmi2GetReal: unknown value reference");
-        value[i] = twin->v[vr[i]];
+/* Functions that read or write the values of a type. */
+#define ACCESS(NAME, VALUES, FUNCTION)                                                              \
+    fmi2Status fmi2##NAME(fmi2Component c, const fmi2ValueReference vr[], size_t n, VALUES value[]) \
+    {                                                                                              \
+        return answer(c, __func__, FUNCTION(&((Instance *)c)->twin, vr, n, value));                \
     }
-    return fmi2OK;
-}
 
-fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n,
-                       const fmi2Real value[])
-{
-    Twin *twin = &((Instance *)c)->twin;
-    for (size_t i = 0; i < n; i++) {
-        if (!settable(twin, vr[i]))
-            return refused(c, "fmi2SetReal: this variable cannot be set now");
-        if (!isfinite(value[i]))
-            return refused(c, "fmi2SetReal: a value that is not finite");
-        twin->v[vr[i]] = value[i];
-    }
-    twin->ready = 0;
-    return fmi2OK;
-}
-
-fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t n,
-                          fmi2Integer value[])
-{
-    for (size_t i = 0; i < n; i++) {
-        if (vr[i] != SEED)
-            return refused(c, "fmi2GetInteger: unknown value reference");
-        value[i] = ((Instance *)c)->twin.seed;
-    }
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t n,
-                          const fmi2Integer value[])
-{
-    Twin *twin = &((Instance *)c)->twin;
-    for (size_t i = 0; i < n; i++) {
-        if (vr[i] != SEED || twin->begun)
-            return refused(c, "fmi2SetInteger: only the seed can be set, before the begin");
-        twin->seed = value[i];
-    }
-    return fmi2OK;
-}
-
-fmi2Status fmi2GetBoolean(fmi2Component c, const fmi2ValueReference vr[], size_t n,
-                          fmi2Boolean value[])
-{
-    for (size_t i = 0; i < n; i++) {
-        int found = flag(&((Instance *)c)->twin, vr[i]);
-        if (found < 0)
-            return refused(c, "fmi2GetBoolean: unknown value reference");
-        value[i] = found ? fmi2True : fmi2False;
-    }
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference vr[], size_t n,
-                          const fmi2Boolean value[])
-{
-    Twin *twin = &((Instance *)c)->twin;
-    for (size_t i = 0; i < n; i++) {
-        if (vr[i] != NOISY)
-            return refused(c, "fmi2SetBoolean: this variable cannot be set");
-        twin->noisy = value[i] != fmi2False;
-    }
-    twin->ready = 0;
-    return fmi2OK;
-}
-
-fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2String value[])
-{
-    (void)vr, (void)value;
-    return n ? refused(c, "fmi2GetString: there are no strings") : fmi2OK;
-}
-
-fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference vr[], size_t n,
-                         const fmi2String value[])
-{
-    (void)vr, (void)value;
-    return n ? refused(c, "fmi2SetString: there are no strings") : fmi2OK;
-}
+ACCESS(GetReal, fmi2Real, get_reals)
+ACCESS(SetReal, const fmi2Real, set_reals)
+ACCESS(GetInteger, fmi2Integer, get_integers)
+ACCESS(SetInteger, const fmi2Integer, set_integers)
+ACCESS(GetBoolean, fmi2Boolean, get_booleans)
+ACCESS(SetBoolean, const fmi2Boolean, set_booleans)
 
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state)
 {
-    if (!*state && !(*state = malloc(sizeof(Twin))))
-        return refused(c, "fmi2GetFMUstate: no memory");
-    memcpy(*state, &((Instance *)c)->twin, sizeof(Twin));
-    return fmi2OK;
+    return answer(c, __func__, copy(&((Instance *)c)->twin, state));
 }
 
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state)
 {
     if (!state)
-        return refused(c, "fmi2SetFMUstate: no state");
+        return answer(c, __func__, "no state");
     memcpy(&((Instance *)c)->twin, state, sizeof(Twin));
     return fmi2OK;
 }
@@ -220,65 +131,30 @@ fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_
 
 fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size)
 {
-    if (size < sizeof(Twin))
-        return refused(c, "fmi2SerializeFMUstate: too few bytes");
-    memcpy(bytes, state, sizeof(Twin));
-    return fmi2OK;
+    void *to = bytes;
+    return answer(c, __func__, size < sizeof(Twin) ? "too few bytes" : copy(state, &to));
 }
 
 fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size,
                                    fmi2FMUstate *state)
 {
-    if (size != sizeof(Twin))
-        return refused(c, "fmi2DeSerializeFMUstate: a state of another model");
-    if (!*state && !(*state = malloc(sizeof(Twin))))
-        return refused(c, "fmi2DeSerializeFMUstate: no memory");
-    memcpy(*state, bytes, sizeof(Twin));
-    return fmi2OK;
-}
-
-fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknown[], size_t n,
-                                        const fmi2ValueReference known[], size_t m,
-                                        const fmi2Real by[], fmi2Real value[])
-{
-    (void)unknown, (void)n, (void)known, (void)m, (void)by, (void)value;
-    return refused(c, "fmi2GetDirectionalDerivative: not provided");
-}
-
-fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n,
-                                       const fmi2Integer order[], const fmi2Real value[])
-{
-    (void)vr, (void)order, (void)value;
-    return n ? refused(c, "fmi2SetRealInputDerivatives: not provided") : fmi2OK;
-}
-
-fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n,
-                                        const fmi2Integer order[], fmi2Real value[])
-{
-    (void)vr, (void)order, (void)value;
-    return n ? refused(c, "fmi2GetRealOutputDerivatives: not provided") : fmi2OK;
+    return answer(c, __func__, size != sizeof(Twin) ? "a state of another model" : copy(bytes, state));
 }
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step, fmi2Boolean no_set)
 {
+    Instance *of = c;
+    const char *wrong = step_to(&of->twin, time, step);
     (void)no_set;
-    if (!(step > 0.0))
-        return refused(c, "fmi2DoStep: a step that is not positive");
-    if (!advance_to(&((Instance *)c)->twin, time + step))
-        return refused(c, "fmi2DoStep: the states do not stay finite");
-    warn(c);
-    return fmi2OK;
+    if (!wrong && of->twin.outside && !of->twin.warned++ && of->callbacks.logger)
+        of->callbacks.logger(of->callbacks.componentEnvironment, of->name, fmi2Warning,
+                             "logStatusWarning", "%s", LEFT);
+    return answer(c, __func__, wrong);
 }
 
 fmi2Status fmi2CancelStep(fmi2Component c)
 {
-    return refused(c, "fmi2CancelStep: no step is running");
-}
-
-fmi2Status fmi2GetStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Status *value)
-{
-    (void)c, (void)kind, (void)value;
-    return fmi2Discard;
+    return answer(c, __func__, "no step is running");
 }
 
 fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Real *value)
@@ -289,23 +165,40 @@ fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Rea
     return fmi2OK;
 }
 
-fmi2Status fmi2GetIntegerStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Integer *value)
-{
-    (void)c, (void)kind, (void)value;
-    return fmi2Discard;
-}
-
 fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Boolean *value)
 {
+    (void)c;
     if (kind != fmi2Terminated)
         return fmi2Discard;
-    (void)c;
     *value = fmi2False;
     return fmi2OK;
 }
 
-fmi2Status fmi2GetStringStatus(fmi2Component c, const fmi2StatusKind kind, fmi2String *value)
-{
-    (void)c, (void)kind, (void)value;
-    return fmi2Discard;
-}
+/* What a model without strings and derivatives does not have; the parameters are those of the
+   standard, in its order. */
+#define MISSING(NAME, PARAMETERS, RESULT, ...)                                                      \
+    fmi2Status fmi2##NAME PARAMETERS                                                               \
+    {                                                                                              \
+        (void)c, __VA_ARGS__;                                                                      \
+        return RESULT;                                                                             \
+    }
+#define NOT_PROVIDED answer(c, __func__, "not provided")
+
+MISSING(GetString, (fmi2Component c, const fmi2ValueReference a[], size_t b, fmi2String d[]),
+        b ? NOT_PROVIDED : fmi2OK, (void)a, (void)d)
+MISSING(SetString, (fmi2Component c, const fmi2ValueReference a[], size_t b, const fmi2String d[]),
+        b ? NOT_PROVIDED : fmi2OK, (void)a, (void)d)
+MISSING(GetDirectionalDerivative, (fmi2Component c, const fmi2ValueReference a[], size_t b,
+        const fmi2ValueReference d[], size_t e, const fmi2Real f[], fmi2Real g[]), NOT_PROVIDED,
+        (void)a, (void)b, (void)d, (void)e, (void)f, (void)g)
+MISSING(SetRealInputDerivatives, (fmi2Component c, const fmi2ValueReference a[], size_t b,
+        const fmi2Integer d[], const fmi2Real e[]), b ? NOT_PROVIDED : fmi2OK, (void)a, (void)d,
+        (void)e)
+MISSING(GetRealOutputDerivatives, (fmi2Component c, const fmi2ValueReference a[], size_t b,
+        const fmi2Integer d[], fmi2Real e[]), b ? NOT_PROVIDED : fmi2OK, (void)a, (void)d, (void)e)
+MISSING(GetStatus, (fmi2Component c, const fmi2StatusKind a, fmi2Status *b), fmi2Discard, (void)a,
+        (void)b)
+MISSING(GetIntegerStatus, (fmi2Component c, const fmi2StatusKind a, fmi2Integer *b), fmi2Discard,
+        (void)a, (void)b)
+MISSING(GetStringStatus, (fmi2Component c, const fmi2StatusKind a, fmi2String *b), fmi2Discard,
+        (void)a, (void)b)

@@ -1,7 +1,6 @@
 /* The co-simulation interface of FMI 3.0 of a twin, which stands above this text with TOKEN. */
 
-#include <stdlib.h>
-#include "fmi3Functions.h"
+#include <stdio.h>
 
 typedef struct {
     Twin twin;
@@ -9,18 +8,15 @@ typedef struct {
     fmi3InstanceEnvironment environment;
 } Instance;
 
-static fmi3Status refused(Instance *of, const char *message)
+/* The status of a function, with a message where something is wrong. */
+static fmi3Status answer(Instance *of, const char *function, const char *wrong)
 {
-    if (of && of->log)
+    char message[256];
+    if (wrong && of && of->log) {
+        snprintf(message, sizeof message, "%s: %s", function, wrong);
         of->log(of->environment, fmi3Error, "logStatusError", message);
-    return fmi3Error;
-}
-
-/* A message at the first sample that is outside the range of training. */
-static void warn(Instance *of)
-{
-    if (of->twin.outside && !of->twin.warned++ && of->log)
-        of->log(of->environment, fmi3Warning, "logStatusWarning", LEFT);
+    }
+    return wrong ? fmi3Error : fmi3OK;
 }
 
 const char *fmi3GetVersion(void)
@@ -104,102 +100,33 @@ fmi3Status fmi3Terminate(fmi3Instance c)
     return fmi3OK;
 }
 
-fmi3Status fmi3GetFloat64(fmi3Instance c, const fmi3ValueReference vr[], size_t n,
-                          fmi3Float64 value[], size_t m)
-{
-    Twin *twin = &((Instance *)c)->twin;
-    if (m != n)
-        return refused(c, "fmi3GetFloat64: one value for each reference is expected");
-    if (!twin->begun)
-        begin(twin), twin->begun = 0;
-    evaluate(twin);
-    for (size_t i = 0; i < n; i++) {
-        if (vr[i] >= NV)
-            return refused(c, "fmi3GetFloat64: unknown value reference");
-        value[i] = twin->v[vr[i]];
+/* Functions that read or write the values of a type. */
+#define ACCESS(NAME, VALUES, FUNCTION)                                                              \
+    fmi3Status fmi3##NAME(fmi3Instance c, const fmi3ValueReference vr[], size_t n, VALUES value[],  \
+                          size_t m)                                                                \
+    {                                                                                              \
+        if (m != n)                                                                                \
+            return answer(c, __func__, "one value for each reference is expected");                \
+        return answer(c, __func__, FUNCTION(&((Instance *)c)->twin, vr, n, value));                \
     }
-    return fmi3OK;
-}
 
-fmi3Status fmi3SetFloat64(fmi3Instance c, const fmi3ValueReference vr[], size_t n,
-                          const fmi3Float64 value[], size_t m)
-{
-    Twin *twin = &((Instance *)c)->twin;
-    if (m != n)
-        return refused(c, "fmi3SetFloat64: one value for each reference is expected");
-    for (size_t i = 0; i < n; i++) {
-        if (!settable(twin, vr[i]))
-            return refused(c, "fmi3SetFloat64: this variable cannot be set now");
-        if (!isfinite(value[i]))
-            return refused(c, "fmi3SetFloat64: a value that is not finite");
-        twin->v[vr[i]] = value[i];
-    }
-    twin->ready = 0;
-    return fmi3OK;
-}
-
-fmi3Status fmi3GetInt32(fmi3Instance c, const fmi3ValueReference vr[], size_t n, fmi3Int32 value[],
-                        size_t m)
-{
-    for (size_t i = 0; i < n; i++) {
-        if (vr[i] != SEED || m != n)
-            return refused(c, "fmi3GetInt32: unknown value reference");
-        value[i] = ((Instance *)c)->twin.seed;
-    }
-    return fmi3OK;
-}
-
-fmi3Status fmi3SetInt32(fmi3Instance c, const fmi3ValueReference vr[], size_t n,
-                        const fmi3Int32 value[], size_t m)
-{
-    Twin *twin = &((Instance *)c)->twin;
-    for (size_t i = 0; i < n; i++) {
-        if (vr[i] != SEED || m != n || twin->begun)
-            return refused(c, "fmi3SetInt32: only the seed can be set, before the begin");
-        twin->seed = value[i];
-    }
-    return fmi3OK;
-}
-
-fmi3Status fmi3GetBoolean(fmi3Instance c, const fmi3ValueReference vr[], size_t n,
-                          fmi3Boolean value[], size_t m)
-{
-    for (size_t i = 0; i < n; i++) {
-        int found = flag(&((Instance *)c)->twin, vr[i]);
-        if (found < 0 || m != n)
-            return refused(c, "fmi3GetBoolean: unknown value reference");
-        value[i] = found != 0;
-    }
-    return fmi3OK;
-}
-
-fmi3Status fmi3SetBoolean(fmi3Instance c, const fmi3ValueReference vr[], size_t n,
-                          const fmi3Boolean value[], size_t m)
-{
-    Twin *twin = &((Instance *)c)->twin;
-    for (size_t i = 0; i < n; i++) {
-        if (vr[i] != NOISY || m != n)
-            return refused(c, "fmi3SetBoolean: this variable cannot be set");
-        twin->noisy = value[i] ? 1 : 0;
-    }
-    twin->ready = 0;
-    return fmi3OK;
-}
+ACCESS(GetFloat64, fmi3Float64, get_reals)
+ACCESS(SetFloat64, const fmi3Float64, set_reals)
+ACCESS(GetInt32, fmi3Int32, get_integers)
+ACCESS(SetInt32, const fmi3Int32, set_integers)
+ACCESS(GetBoolean, fmi3Boolean, get_booleans)
+ACCESS(SetBoolean, const fmi3Boolean, set_booleans)
 
 /* Types of which there are no variables. */
+static const char *none(Twin *twin, const uint32_t vr[], size_t n, const void *value)
+{
+    (void)twin, (void)vr, (void)value;
+    return n ? "there are no such variables" : NULL;
+}
+
 #define ABSENT(KIND)                                                                                \
-    fmi3Status fmi3Get##KIND(fmi3Instance c, const fmi3ValueReference vr[], size_t n,              \
-                             fmi3##KIND value[], size_t m)                                         \
-    {                                                                                              \
-        (void)vr, (void)value, (void)m;                                                            \
-        return n ? refused(c, "fmi3Get" #KIND ": there are no such variables") : fmi3OK;           \
-    }                                                                                              \
-    fmi3Status fmi3Set##KIND(fmi3Instance c, const fmi3ValueReference vr[], size_t n,              \
-                             const fmi3##KIND value[], size_t m)                                   \
-    {                                                                                              \
-        (void)vr, (void)value, (void)m;                                                            \
-        return n ? refused(c, "fmi3Set" #KIND ": there are no such variables") : fmi3OK;           \
-    }
+    ACCESS(Get##KIND, fmi3##KIND, none)                                                            \
+    ACCESS(Set##KIND, const fmi3##KIND, none)
 
 ABSENT(Float32)
 ABSENT(Int8)
@@ -213,16 +140,13 @@ ABSENT(String)
 
 fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state)
 {
-    if (!*state && !(*state = malloc(sizeof(Twin))))
-        return refused(c, "fmi3GetFMUState: no memory");
-    memcpy(*state, &((Instance *)c)->twin, sizeof(Twin));
-    return fmi3OK;
+    return answer(c, __func__, copy(&((Instance *)c)->twin, state));
 }
 
 fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state)
 {
     if (!state)
-        return refused(c, "fmi3SetFMUState: no state");
+        return answer(c, __func__, "no state");
     memcpy(&((Instance *)c)->twin, state, sizeof(Twin));
     return fmi3OK;
 }
@@ -244,37 +168,28 @@ fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t
 
 fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[], size_t size)
 {
-    if (size < sizeof(Twin))
-        return refused(c, "fmi3SerializeFMUState: too few bytes");
-    memcpy(bytes, state, sizeof(Twin));
-    return fmi3OK;
+    void *to = bytes;
+    return answer(c, __func__, size < sizeof(Twin) ? "too few bytes" : copy(state, &to));
 }
 
 fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size,
                                    fmi3FMUState *state)
 {
-    if (size != sizeof(Twin))
-        return refused(c, "fmi3DeserializeFMUState: a state of another model");
-    if (!*state && !(*state = malloc(sizeof(Twin))))
-        return refused(c, "fmi3DeserializeFMUState: no memory");
-    memcpy(*state, bytes, sizeof(Twin));
-    return fmi3OK;
+    return answer(c, __func__, size != sizeof(Twin) ? "a state of another model" : copy(bytes, state));
 }
 
 fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 step, fmi3Boolean no_set,
                       fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early,
                       fmi3Float64 *last)
 {
+    Instance *of = c;
+    const char *wrong = step_to(&of->twin, time, step);
     (void)no_set;
     *event = *terminate = *early = false;
-    *last = time;
-    if (!(step > 0.0))
-        return refused(c, "fmi3DoStep: a step that is not positive");
-    if (!advance_to(&((Instance *)c)->twin, time + step))
-        return refused(c, "fmi3DoStep: the states do not stay finite");
-    warn(c);
-    *last = time + step;
-    return fmi3OK;
+    *last = wrong ? time : time + step;
+    if (!wrong && of->twin.outside && !of->twin.warned++ && of->log)
+        of->log(of->environment, fmi3Warning, "logStatusWarning", LEFT);
+    return answer(c, __func__, wrong);
 }
 
 /* What a model without events, clocks and continuous states does not have; the parameters are those
@@ -283,7 +198,7 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 step, fmi3Bo
     fmi3Status fmi3##NAME PARAMETERS                                                               \
     {                                                                                              \
         __VA_ARGS__;                                                                               \
-        return refused(c, "fmi3" #NAME ": not provided");                                          \
+        return answer(c, __func__, "not provided");                                                \
     }
 
 MISSING(EnterEventMode, (fmi3Instance c), (void)0)

@@ -228,7 +228,7 @@ def _sensor_graph(
         "glitch_level": torch.rand(count, samples, 1, generator=generator),
         "glitch_noise": torch.randn(count, samples, width, generator=generator),
     }
-    return Graph(SensorGraph(sensor, width, rate), inputs, unit)
+    return Graph(SensorGraph(sensor, rate), inputs, unit)
 
 
 def _assessment_graphs(

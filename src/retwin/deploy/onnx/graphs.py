@@ -14,6 +14,7 @@ from retwin.diagnosis.features import Features
 from retwin.nets.student import shared_factor
 from retwin.update.corrections import Context, Correction, SampledSensor, sensor_of
 from retwin.update.corrections.tensor_segments import TensorSegments
+from retwin.update.corrections.warp import gather_samples
 from retwin.update.residual import ResidualModel
 from retwin.update.residual.model import describe
 from retwin.update.surrogate import Surrogate
@@ -168,27 +169,16 @@ class SensorGraph(nn.Module):
     ----------
     sensor : SampledSensor
         The fitted sensor.
-    width : int
-        Number of outputs, d_y.
     rate : float
         Sample rate of the outputs in Hz.
 
     """
 
-    error_quantiles: Tensor
-    glitch_size: Tensor
-    resolution: Tensor
-
-    def __init__(self, sensor: SampledSensor, width: int, rate: float) -> None:
+    def __init__(self, sensor: SampledSensor, rate: float) -> None:
         super().__init__()
+        self.sensor = sensor
+        self.rate = rate
         self.every, _ = sensor.timing(rate)
-        self.glitch_probability = sensor.glitch_probability or 0.0
-        for name, values in (
-            ("error_quantiles", sensor.noise or ((0.0, 0.0),) * width),
-            ("glitch_size", sensor.glitch_size or (0.0,) * width),
-            ("resolution", sensor.steps or (0.0,) * width),
-        ):
-            self.register_buffer(name, torch.tensor(values, dtype=torch.float32))
 
     def forward(
         self,
@@ -219,31 +209,12 @@ class SensorGraph(nn.Module):
             The record, linear between sensor samples.
 
         """
-        steps, width = outputs.shape[1], outputs.shape[2]
-        at = phase + self.every * torch.arange(error_level.shape[1])
-        last = (at < steps).sum(dim=1, keepdim=True) - 1
-        values = outputs.gather(1, at.clamp_max(steps - 1)[..., None].expand(-1, -1, width))
-        glitch = (glitch_level < self.glitch_probability) * self.glitch_size * glitch_noise
-        values = values + self._error(error_level) + glitch
-        rounded = self.resolution * (values / self.resolution.clamp_min(1e-30)).round()
-        values = torch.where(self.resolution > 0, rounded, values)
-        place = ((torch.arange(steps) - phase) / self.every).clamp_min(0)
-        left = place.floor().long().minimum(last)
-        share = (place - left).clamp(0, 1)[..., None]
-        before, after = (
-            values.gather(1, index[..., None].expand(-1, -1, width))
-            for index in (left, (left + 1).minimum(last))
-        )
-        return before + share * (after - before)
-
-    def _error(self, level: Tensor) -> Tensor:
-        """The sensor's errors (n, S, d_y) at these levels, linear between the fitted quantiles."""
-        last = self.error_quantiles.shape[1] - 1
-        place = level * last
-        below = place.floor().long().clamp(0, last - 1)
-        quantiles = self.error_quantiles.T[None].expand(level.shape[0], -1, -1)
-        left, right = quantiles.gather(1, below), quantiles.gather(1, below + 1)
-        return left + (place - below) * (right - left)
+        steps = outputs.shape[1]
+        when = (phase + self.every * torch.arange(error_level.shape[1])).clamp_max(steps - 1)
+        values = gather_samples(outputs, when) + self.sensor.glitches(glitch_level, glitch_noise)
+        if self.sensor.noise is not None:
+            values = values + self.sensor.regular_errors(error_level)
+        return self.sensor.record(values, when, steps, self.rate)
 
 
 def sampling_sensor(correction: Correction) -> SampledSensor | None:

@@ -221,17 +221,27 @@ class SampledSensor:
         error = torch.zeros(shape, dtype=dtype, device=device)
         if self.noise is not None:
             level = torch.rand(shape, generator=generator, dtype=torch.float64, device=device)
-            for j, quantiles in enumerate(self.noise):
-                quantile = level.new_tensor(quantiles)
-                place = level[..., j] * (len(quantile) - 1)
-                left = place.long().clamp_max(len(quantile) - 2)
-                error[..., j] = torch.lerp(quantile[left], quantile[left + 1], place - left)
+            error = self.regular_errors(level).to(dtype)
         if self.glitch_probability and self.glitch_size is not None:
-            level = torch.rand(shape[:2], generator=generator, device=device)
+            level = torch.rand((*shape[:2], 1), generator=generator, device=device)
             size = torch.randn(shape, generator=generator, device=device).to(dtype)
-            hit = level < self.glitch_probability
-            error = error + hit[..., None] * error.new_tensor(self.glitch_size) * size
+            error = error + self.glitches(level, size)
         return error
+
+    def regular_errors(self, level: Tensor) -> Tensor:
+        """Errors (n, R, d_y) at such levels of their quantiles, which are linear in between."""
+        errors = []
+        for quantiles, own in zip(self.noise or (), level.unbind(-1), strict=True):
+            quantile = level.new_tensor(quantiles)
+            place = own * (len(quantile) - 1)
+            left = place.long().clamp_max(len(quantile) - 2)
+            errors.append(torch.lerp(quantile[left], quantile[left + 1], place - left))
+        return torch.stack(errors, dim=-1)
+
+    def glitches(self, level: Tensor, size: Tensor) -> Tensor:
+        """Errors (n, R, d_y) of glitches by uniform (n, R, 1) and normal (n, R, d_y) noise."""
+        hit = level < (self.glitch_probability or 0.0)
+        return hit * size.new_tensor(self.glitch_size or 0.0) * size
 
 
 def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:

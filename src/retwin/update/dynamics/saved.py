@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from retwin.checks import one_of, require
-from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.serialisation.models import read_model, refusing, save_model
 from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.corrected import correctable
@@ -50,8 +50,7 @@ def write_fields(folder: str | Path, fields: Mapping[str, Any]) -> None:
     }
     arrays = {name: fields[name] for name in ARRAYS}
     arrays |= {f"domain_{name}": getattr(fields["domain"], name) for name in DOMAIN}
-    with write_model(folder, KIND, about, {k: torch.tensor(v) for k, v in arrays.items()}):
-        pass
+    save_model(folder, KIND, about, {k: torch.tensor(v) for k, v in arrays.items()})
 
 
 def read_fields(folder: str | Path) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
-from retwin.serialisation.models import read_model, write_model
+from retwin.serialisation.models import read_model, save_model
 from retwin.twins.faults import Fault
 from retwin.twins.noisy import sensor_sample_count
 from retwin.twins.parametric import ParametricTwin
@@ -99,8 +99,7 @@ class PosteriorTwin(TwinWrapper):
             "emulated": self.emulated,
         }
         drawn = {"samples": self.samples, "logs": self.logs, "unit": self.unit}
-        with write_model(folder, KIND, about, {k: torch.tensor(v) for k, v in drawn.items()}):
-            pass
+        save_model(folder, KIND, about, {k: torch.tensor(v) for k, v in drawn.items()})
 
     @classmethod
     def load(cls, folder: str | Path, twin: ParametricTwin) -> PosteriorTwin:

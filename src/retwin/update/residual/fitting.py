@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TypeVar, overload
+from typing import Required, TypedDict, TypeVar, Unpack, overload
 
 import numpy as np
 import torch
@@ -91,19 +91,24 @@ def infer_discrepancy(
     return context, correction.infer(context, *_measured(trajectories))
 
 
+class Options(TypedDict, total=False):
+    """The keyword arguments of `fit_residual`."""
+
+    seed: Required[int]
+    calibrate_on: str | Mapping[str, Fault | None]
+    bounds: NDArray | None
+    segments: Segments | str
+    twin: Twin | None
+    progress: Progress | None
+
+
 @overload
 def fit_residual(
     surrogate: Surrogate | Twin,
     calibration: Trajectories,
     correction: Correction = ...,
     density: Density = ...,
-    *,
-    seed: int,
-    calibrate_on: str | Mapping[str, Fault | None] = ...,
-    bounds: NDArray | None = ...,
-    segments: Segments | str = ...,
-    twin: Twin | None = ...,
-    progress: Progress | None = ...,
+    **options: Unpack[Options],
 ) -> ResidualModel: ...
 
 
@@ -113,13 +118,7 @@ def fit_residual(
     calibration: Trajectories,
     correction: Correction,
     density: SequenceMixture,
-    *,
-    seed: int,
-    calibrate_on: str | Mapping[str, Fault | None] = ...,
-    bounds: NDArray | None = ...,
-    segments: Segments | str = ...,
-    twin: Twin | None = ...,
-    progress: Progress | None = ...,
+    **options: Unpack[Options],
 ) -> SequenceResidual: ...
 
 
@@ -129,13 +128,7 @@ def fit_residual(
     calibration: Trajectories,
     correction: Correction,
     density: StationaryNoise,
-    *,
-    seed: int,
-    calibrate_on: str | Mapping[str, Fault | None] = ...,
-    bounds: NDArray | None = ...,
-    segments: Segments | str = ...,
-    twin: Twin | None = ...,
-    progress: Progress | None = ...,
+    **options: Unpack[Options],
 ) -> StationaryResidual: ...
 
 

@@ -10,16 +10,15 @@ import torch
 from torch import Tensor, nn
 
 from retwin.checks import require
-from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.nets.networks import Standardise
 from retwin.nets.student import Student, shared_factor
-from retwin.update.corrections import Context, Correction
+from retwin.update.corrections import Context
 from retwin.update.residual.residual import Residual
 from retwin.update.residual.settings import Density
 
 
-class ResidualModel(Residual):
+class ResidualModel(Residual[Density]):
     """The distribution of z (n, M, d_z) given a `Context`: call it to get a torch distribution.
 
     Parameters
@@ -45,27 +44,18 @@ class ResidualModel(Residual):
 
     kind = "residual"
 
-    def __init__(
-        self,
-        correction: Correction,
-        density: Density,
-        *,
-        inputs: Channels,
-        outputs: Channels,
-        segmentation: str = "commands",
-    ) -> None:
+    def _check_correction(self) -> None:
         require(
-            getattr(correction, "resolution", "") == "segment",
+            getattr(self.correction, "resolution", "") == "segment",
             "correction",
             expected="an operator with one z per segment",
-            got=repr(correction),
+            got=repr(self.correction),
             remedy="use DelayOffset, CommandSpace, or a Chain of one with a SampledSensor; or, for "
             "one z per sample, a SequenceMixture as the density",
         )
-        super().__init__(
-            correction, density, inputs=inputs, outputs=outputs, segmentation=segmentation
-        )
-        features = 3 * (len(inputs) + len(outputs)) + 2
+
+    def _build(self) -> None:
+        features, density = 3 * (len(self.inputs) + len(self.outputs)) + 2, self.density
         self.before = Standardise(features)
         layers: list[nn.Module] = []
         width = features
@@ -77,9 +67,9 @@ class ResidualModel(Residual):
             density.head(width, block.width)
             if block.kind == "mixture"
             else BernoulliHead(width, block.width)
-            for block in correction.heads(inputs, outputs)
+            for block in self.correction.heads(self.inputs, self.outputs)
         )
-        self.register_buffer("spread", torch.ones(len(self.latent)))
+        self.spread = nn.Buffer(torch.ones(len(self.latent)))
 
     def forward(self, context: Context) -> Blocks:
         """The distribution q_ψ(z | u, ŷ), in physical units."""

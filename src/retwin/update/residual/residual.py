@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import torch
@@ -21,12 +21,14 @@ from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import Blocks
 from retwin.nets.training import Fit
 from retwin.serialisation.configs import from_config, to_config
-from retwin.serialisation.models import read_model, write_model
+from retwin.serialisation.models import read_model, save_model
 from retwin.update.corrections import Context, Correction
 from retwin.update.surrogate import Surrogate
 
+D = TypeVar("D")
 
-class Residual(nn.Module, ABC):
+
+class Residual(nn.Module, ABC, Generic[D]):
     """The distribution of z given a `Context`: call it to get a torch distribution.
 
     Parameters
@@ -64,16 +66,12 @@ class Residual(nn.Module, ABC):
 
     kind: ClassVar[str]
     """Kind of the saved model."""
-    bounds: Tensor
-    shift: Tensor
-    scale: Tensor
-    persistence: Tensor
     spread: Tensor
 
     def __init__(
         self,
         correction: Correction,
-        density: Any,
+        density: D,
         *,
         inputs: Channels,
         outputs: Channels,
@@ -85,15 +83,26 @@ class Residual(nn.Module, ABC):
         self.inputs = inputs
         self.outputs = outputs
         self.segmentation = segmentation
+        self._check_correction()
         self.latent = correction.latent(inputs, outputs)
         self.sizes = [head.width for head in correction.heads(inputs, outputs)]
         self.degrees = [math.inf] * len(self.sizes)
         self.emulated = False
         self.timing: NDArray = np.empty((0, 0))
         self.fitted: Fit | None = None
-        for name in ("bounds", "shift", "scale"):
-            self.register_buffer(name, torch.ones(len(self.latent)))
-        self.register_buffer("persistence", torch.zeros(len(self.latent)))
+        self.bounds = nn.Buffer(torch.ones(len(self.latent)))
+        self.shift = nn.Buffer(torch.ones(len(self.latent)))
+        self.scale = nn.Buffer(torch.ones(len(self.latent)))
+        self.persistence = nn.Buffer(torch.zeros(len(self.latent)))
+        self._build()
+
+    @abstractmethod
+    def _check_correction(self) -> None:
+        """Raise InputError for an operator whose z this model cannot have."""
+
+    @abstractmethod
+    def _build(self) -> None:
+        """Make the networks, with random initial weights, and further buffers."""
 
     def context(
         self,
@@ -147,8 +156,7 @@ class Residual(nn.Module, ABC):
             "timing": [[None if np.isnan(t) else t for t in row] for row in self.timing],
             "fitted": None if self.fitted is None else asdict(self.fitted),
         }
-        with write_model(folder, self.kind, about, self.state_dict()):
-            pass
+        save_model(folder, self.kind, about, self.state_dict())
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:

@@ -18,11 +18,10 @@ from scipy.signal import lfilter
 from torch import Tensor, nn
 
 from retwin.checks import require
-from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import Blocks, GaussianMixture, MixtureHead
 from retwin.nets.networks import LSTM, Network, Standardise
 from retwin.nets.training import Training
-from retwin.update.corrections import Context, Correction
+from retwin.update.corrections import Context
 from retwin.update.residual.residual import Residual
 
 
@@ -139,7 +138,7 @@ class Member(nn.Module):
         )
 
 
-class SequenceResidual(Residual):
+class SequenceResidual(Residual[SequenceMixture]):
     """The distribution of z (n, T, d_z) given a `Context`: call it to get a torch distribution.
 
     Parameters
@@ -166,32 +165,22 @@ class SequenceResidual(Residual):
     """
 
     kind = "sequence residual"
-    trust: Tensor
 
-    def __init__(
-        self,
-        correction: Correction,
-        density: SequenceMixture,
-        *,
-        inputs: Channels,
-        outputs: Channels,
-        segmentation: str = "commands",
-    ) -> None:
-        kinds = {head.kind for head in correction.heads(inputs, outputs)}
+    def _check_correction(self) -> None:
+        kinds = {head.kind for head in self.correction.heads(self.inputs, self.outputs)}
         require(
-            correction.resolution == "step" and kinds == {"mixture"},
+            self.correction.resolution == "step" and kinds == {"mixture"},
             "correction",
             expected="an operator with one z per sample, none of it an event",
-            got=repr(correction),
+            got=repr(self.correction),
             remedy="use Additive, or a density such as Mixture for one z per segment",
         )
-        super().__init__(
-            correction, density, inputs=inputs, outputs=outputs, segmentation=segmentation
-        )
-        self.before = Standardise(len(inputs) + len(outputs))
+
+    def _build(self) -> None:
+        self.before = Standardise(len(self.inputs) + len(self.outputs))
         self.members = self.fresh()
-        self.register_buffer("trust", torch.ones(len(self.latent)))
-        self.register_buffer("spread", torch.ones(()))
+        self.trust = nn.Buffer(torch.ones(len(self.latent)))
+        self.spread = nn.Buffer(torch.ones(()))
 
     def fresh(self) -> nn.ModuleList:
         """Members with random initial weights."""

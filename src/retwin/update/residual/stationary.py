@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from retwin.checks import require
-from retwin.data.trajectories import Channels, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.nets.mixtures import Blocks, GaussianMixture
 from retwin.nets.training import Fit
 from retwin.update.corrections import Context, Correction, Discrepancy
@@ -26,7 +26,7 @@ class StationaryNoise:
     """
 
 
-class StationaryResidual(Residual):
+class StationaryResidual(Residual[StationaryNoise]):
     """The distribution of z (n, T, d_z), which depends on no command.
 
     Parameters
@@ -47,26 +47,17 @@ class StationaryResidual(Residual):
 
     kind = "stationary residual"
 
-    def __init__(
-        self,
-        correction: Correction,
-        density: StationaryNoise,
-        *,
-        inputs: Channels,
-        outputs: Channels,
-        segmentation: str = "commands",
-    ) -> None:
+    def _check_correction(self) -> None:
         require(
-            correction.resolution == "step",
+            self.correction.resolution == "step",
             "correction",
             expected="an operator with one z per sample",
-            got=repr(correction),
+            got=repr(self.correction),
             remedy="use Additive",
         )
-        super().__init__(
-            correction, density, inputs=inputs, outputs=outputs, segmentation=segmentation
-        )
-        self.register_buffer("spread", torch.ones(len(self.latent)))
+
+    def _build(self) -> None:
+        self.spread = nn.Buffer(torch.ones(len(self.latent)))
 
     def forward(self, context: Context) -> Blocks:
         """The same Gaussian distribution at every sample."""

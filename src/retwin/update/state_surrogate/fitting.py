@@ -14,7 +14,7 @@ from retwin.arrays import floats
 from retwin.checks import apart, finite, positive, require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.serialisation.models import read_model, refusing, save_model
 from retwin.twins.limits import Limits
 from retwin.twins.parametric import Parameter
 from retwin.twins.samplers import CommandSampler
@@ -133,8 +133,7 @@ class FittedStateSurrogate:
             "seconds": self.seconds,
             "reason": self.reason,
         }
-        with write_model(folder, KIND, about, {}):
-            pass
+        save_model(folder, KIND, about, {})
 
     @classmethod
     def load(cls, folder: str | Path) -> FittedStateSurrogate:
