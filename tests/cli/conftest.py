@@ -241,7 +241,5 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> Path:
         rt.save(data.replace(observed=output), made / f"{name}.npz")
     fitted = fit_dynamics(system.twin, rt.load(made / "fit.npz"), system.dynamics).twin
     replace(fitted, case=str(made / "case.toml")).save(made / "model")
-    fit_monitor(fitted, rt.load(made / "healthy.npz"), "1 per day", blanking=30).save(
-        made / "watch"
-    )
+    fit_monitor(fitted, rt.load(made / "healthy.npz"), "1 per day").save(made / "watch")
     return made

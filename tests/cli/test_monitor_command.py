@@ -24,12 +24,13 @@ def test_a_monitor_is_calibrated_and_its_promise_printed(watched: Path, call, tm
     found = json.loads(printed)
     assert found["arl"] == 86400
     assert "86400 measured samples (1 day)" in found["promises"]["level"]
+    assert sum(found["tried"]["events"].values()) == 0
     code, printed, _ = call("monitor", "replay", out, watched / "healthy.npz", "--case", "none")
     assert code == 2
 
 
 def test_an_alarm_without_a_cause_is_written_without_its_time() -> None:
-    nothing, alarm = (np.nan,) * 3, Alarm("tank", 3, 3.0, "level", "higher than predicted", 1e6)
+    nothing, alarm = (np.nan,) * 3, Alarm("tank", 3, 3.0, "level", "higher than predicted", 1e6, 3)
     named = {"leaking": 0.3, "Healthy": 0.7}
     assert _written(Cause(alarm, "Healthy", 0.7, 0.9, nothing, nothing, named)) == "no known fault"
     onset = (2.0, 1.0, 3.0)
@@ -47,8 +48,11 @@ def test_a_leak_is_reported_with_its_time_and_cause(watched: Path, call) -> None
     assert abs(first["cause"]["onset"][0] - 300) < 4
     both = (watched / "healthy.npz", watched / "leak.npz")
     code, printed, _ = call("monitor", "replay", watch, *both, *case)
-    assert "healthy.npz: 0 alarms in 0.111 measured hours." in printed
+    assert "healthy.npz: 0 events in 0.111 measured hours." in printed
     assert "leaking from" in printed
+    words = " ".join(printed.split())
+    assert "Seen, if all was healthy: 1 events in 0.222 h, at most one in" in words
+    assert "(exact 95 % bound). Promised under the model: at most one in" in words
 
 
 def test_a_log_is_watched_by_its_mapping(watched: Path, call, tmp_path: Path) -> None:
@@ -102,7 +106,7 @@ def test_trajectories_are_watched_by_a_diagnoser(watched: Path, call, tmp_path: 
         rt.save(twin.simulate(valve, faults=[fault] * count, seed=2), tmp_path / f"{name}.npz")
     given = ("monitor", "fit", tmp_path / "physics", tmp_path / "healthy.npz", *case)
     out = ("--out", tmp_path / "watch")
-    code, _, err = call(*given, *out, "--blanking", "5")
+    code, _, err = call(*given, *out, "--lasting", "5")
     assert (code, "whole trajectories" in err) == (2, True), err
     code, printed, err = call(*given, *out, "--false-alarms", "500 trajectories")
     assert code == 0, err

@@ -138,7 +138,7 @@ def main(folder: Path, url: str, kills: int, seed: int) -> None:
     """Kill the process at random moments, let it finish, and compare with one that was not."""
     rng = np.random.default_rng(seed)
     twin = fit_dynamics(TANK, recorded(9001, 1000), Dynamics(Library(0, (), False))).twin
-    fit_monitor(twin, recorded(9002, 1000), "1 per day", blanking=30.0).save(folder / "watch")
+    fit_monitor(twin, recorded(9002, 1000), "1 per day").save(folder / "watch")
     prepared(folder / "killed", url)
     streams()
     done = 0

@@ -85,7 +85,7 @@ def served(folder: Path) -> Iterator[Served]:
     with Store(folder / "store") as store:
         registry = Registry(store, TWIN)
         for number, version in ((1, replace(twin, noise=9 * twin.noise)), (2, twin)):
-            made = fit_monitor(version, recorded(1, count=2), "1 per day", blanking=30.0)
+            made = fit_monitor(version, recorded(1, count=2), "1 per day")
             made.save(folder / f"{number}")
             registry.propose(folder / f"{number}", f"<b>number</b> {number}")
         registry.promote(1)

@@ -63,7 +63,7 @@ def rows(record: rt.Trajectories, i: int = 0) -> np.ndarray:
 @pytest.fixture(scope="module")
 def monitor() -> Monitor:
     twin = fit_dynamics(TANK, recorded(0), Dynamics(Library(0, (), False))).twin
-    return fit_monitor(twin, recorded(1, count=2), "1 per day", blanking=30.0)
+    return fit_monitor(twin, recorded(1, count=2), "1 per day")
 
 
 @pytest.fixture(scope="module")
@@ -106,18 +106,23 @@ LEAK = ParameterShift("drain", size=0.2, onset=200.0)
 
 def test_alarms_are_those_of_the_monitor(store: Store, monitor: Monitor) -> None:
     live, made = opened(store), recorded(5, LEAK)
-    expected = monitor.watch(made).alarms
-    assert expected
+    watched = monitor.watch(made)
+    expected = watched.alarms
+    assert len(expected) > len(watched.events) > 0
     (found,) = live.submit([samples(rows(made))])
-    assert (found.counts.used, found.alarms) == (STEPS, len(expected))
-    first = alarms(store)[0]
+    assert (found.counts.used, found.alarms) == (STEPS, len(watched.events))
+    logged = alarms(store)
+    assert [each["sample"] for each in logged] == [each.sample for each in expected]
+    assert [each["event"] for each in logged] == [BEGIN + SECOND * each.event for each in expected]
+    first = logged[0]
     assert first["time"] == BEGIN + SECOND * expected[0].sample
     assert (first["asset"], first["output"], first["version"]) == ("a", "level", 1)
     assert first["evidence"] == expected[0].evidence
     recent = live.recent("a")
     assert recent.mean.shape == (len(recent.times), 1) == recent.commands.shape
     (status,) = live.status()
-    assert (status.time, status.alarms) == (BEGIN + SECOND * (STEPS - 1), len(expected))
+    assert (status.time, status.alarms) == (BEGIN + SECOND * (STEPS - 1), len(watched.events))
+    assert status.event == watched.event[0, -1]
     live.acknowledge(next(store.log("alarm")).sequence, "me", "a leak")
     with pytest.raises(InputError, match="sequence"):
         live.acknowledge(0, "me")
@@ -376,8 +381,10 @@ def test_alarms_are_explained_beside_the_stream_and_after_a_restart(store: Store
         live.submit([samples(made[:210])])
         explanations.wait()
     live.submit([samples(made[210:], 210)])
-    (cause,) = [entry.data for entry in store.log("cause")]
+    cause, *further = [entry.data for entry in store.log("cause")]
     assert cause == reported[0]
+    assert not cause["same"]
+    assert all(each["same"] for each in further)  # of the event that the leak has opened
     assert (cause["name"], cause["alarm"]) == (
         "drain changed",
         next(iter(store.log("alarm"))).sequence,

@@ -61,7 +61,7 @@ def twin() -> DynamicsTwin:
 
 @pytest.fixture(scope="module")
 def monitor(twin: DynamicsTwin) -> Monitor:
-    return fit_monitor(twin, record(2, 1), "1 per hour", blanking=5.0)
+    return fit_monitor(twin, record(2, 1), "1 per hour")
 
 
 def leaking(seed: int = 5) -> rt.Trajectories:
@@ -73,7 +73,8 @@ def leaking(seed: int = 5) -> rt.Trajectories:
 
 def arrays_of(watched: Watched) -> list[np.ndarray]:
     names = (each.name for each in fields(watched))
-    return [getattr(watched, each) for each in names if each not in ("alarms", "outside")]
+    lists = ("alarms", "endings", "outside")
+    return [getattr(watched, each) for each in names if each not in lists]
 
 
 def cut(monitor: Monitor, whole: rt.Trajectories, places: list[int]) -> tuple[list, list, list]:
@@ -83,7 +84,7 @@ def cut(monitor: Monitor, whole: rt.Trajectories, places: list[int]) -> tuple[li
     for part in zip(*parts, strict=True):
         state, found = monitor.step(state, *part, whole.ids)
         arrays.append(arrays_of(found))
-        alarms += found.alarms
+        alarms += [*found.alarms, *found.endings]
     joined = [np.concatenate(each, axis=1).tobytes() for each in zip(*arrays, strict=True)]
     return joined, alarms, [each.tobytes() for each in state.arrays().values()]
 
@@ -116,10 +117,38 @@ def test_a_machine_is_watched_the_same_beside_others(monitor: Monitor) -> None:
         np.testing.assert_array_equal(both[0][1], both[1][0])
 
 
-def test_no_alarm_is_raised_in_the_pause_after_one(monitor: Monitor) -> None:
-    times = [each.time for each in monitor.watch(leaking()).alarms]
-    assert len(times) > 1
-    assert np.diff(times).min() > 5.0
+def pulse(until: float) -> rt.Trajectories:
+    """A machine that leaks from 30 s on, until a time in s."""
+    leak = ParameterShift("drain", size=1.3, onset=30.0, end=until)
+    return record(1, 5, steps=1200, faults=[leak])
+
+
+def test_an_event_lasts_until_the_twin_follows_again(monitor: Monitor) -> None:
+    found = monitor.watch(pulse(40.0))
+    (first,), (end,) = found.events, found.endings
+    assert 30.0 < first.time < 33.0
+    assert (end.event, end.how) == (first.sample, "the twin follows again")
+    assert 40.0 < end.sample / RATE < 60.0
+    assert all(each.event == first.sample for each in found.alarms)
+    np.testing.assert_array_equal(
+        np.flatnonzero(found.event[0]), np.arange(first.sample, end.sample + 1)
+    )
+    assert not found.void.any()
+
+
+def test_an_event_that_does_not_end_is_a_change_and_new_faults_alarm(monitor: Monitor) -> None:
+    soon = replace(monitor, lasting=10.0)
+    found = soon.watch(
+        record(1, 5, steps=1200, faults=[ParameterShift("drain", size=1.3, onset=30.0)])
+    )
+    changed = [each for each in found.endings if each.how == "changed"]
+    assert changed
+    assert changed[0].sample - changed[0].event == 100
+    whole = pulse(1e9)
+    offset = whole.replace(observed=whole.observed + 0.5 * (np.arange(1200) >= 1000)[None, :, None])
+    late = [each.time for each in soon.watch(offset).alarms if each.time >= 100.0]
+    assert late
+    assert late[0] < 103.0
 
 
 def test_the_state_is_arrays_that_are_joined_and_divided(monitor: Monitor) -> None:
@@ -135,10 +164,14 @@ def test_the_state_is_arrays_that_are_joined_and_divided(monitor: Monitor) -> No
 
 
 def test_a_machine_that_was_rebuilt_voids_the_promise(monitor: Monitor) -> None:
-    found = monitor.watch(record(1, 7, steps=3000, drain=2.6))
+    found = replace(monitor, lasting=5.0).watch(record(1, 7, steps=1200, drain=2.6))
+    assert "changed" in {each.how for each in found.endings}
     assert found.void[0, -1]
     assert not found.void[0, 0]
-    assert not monitor.watch(record(4, 8, steps=3000)).void.any()
+    # What is seen from then on are remarks.
+    assert {each.promised for each in found.alarms} == {True, False}
+    assert all(each.promised != found.void[0, each.sample] for each in found.alarms)
+    assert not monitor.watch(record(4, 8, steps=1200)).void.any()
 
 
 def test_what_is_not_measured_is_no_evidence(monitor: Monitor) -> None:
@@ -315,7 +348,7 @@ def test_slack_is_widened_where_the_calibration_contradicts_it() -> None:
     scores = np.random.default_rng(0).normal(size=(2, 2000))
     scores[1, 1000:1040] = 2.0
     given = (Slack(1.1, 0.1), Slack(1.1, 0.1))
-    first, second = agreeing(given, scores, scores)
+    first, second = agreeing(given, [(scores, scores)])
     assert first == given[0]
     assert (second.kappa, second.shift) > (1.1, 0.1)
     detector = Detector(second)

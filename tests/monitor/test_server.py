@@ -68,9 +68,9 @@ def test_the_worst_asset_is_first_and_named_as_it_is(client: httpx.Client) -> No
 def test_an_alarm_has_a_cause_and_is_acknowledged(client: httpx.Client, server: Served) -> None:
     page = client.get("/alarms", params={"limit": 1}).json()
     whole = client.get("/alarms", params={"asset": LEAKING}).json()["alarms"]
-    following = client.get("/alarms", params={"before": page["next"]}).json()["alarms"]
-    assert page["alarms"] + following == whole
+    assert page["alarms"] == whole[:1]
     first = whole[-1]
+    assert first["alarms"] > 1  # one event, to which further alarms belong
     assert 200 <= first["time"] - BEGIN < 230
     assert first["cause"]["name"].startswith("leak")
     assert first["cause"]["unit"] == "1/s"

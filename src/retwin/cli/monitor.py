@@ -15,6 +15,7 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from retwin import catalog
@@ -24,7 +25,7 @@ from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase, argument, 
 from retwin.cli.reading import case_named, read, saved, shown_records
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.quality.check import check_records
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
 
@@ -32,6 +33,8 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
     from retwin.monitor import Alarm, Cause, Monitor, Watched
 
+EVENT = ("file", "record", "from s", "to s", "what", "cause")
+"""What is shown of an event."""
 Reading = Callable[..., Trajectories]
 """`cli.reading.read` with the options of the command."""
 
@@ -51,8 +54,8 @@ def fit(
     false_alarms: Annotated[
         str, option("RATE", 'At most: "1 per month", "2 per year", "1e-6 Hz".')
     ] = "1 per month",
-    blanking: Annotated[
-        float | None, option("S", "Time without alarms after an alarm: 60.")
+    lasting: Annotated[
+        float | None, option("S", "Time after which an event is a lasting change: 3600.")
     ] = None,
     case: OtherCase = None,
     mapping: LogMapping = None,
@@ -61,16 +64,17 @@ def fit(
 ) -> None:
     """Calibrate a monitor on healthy records."""
     from retwin.monitor import fit_monitor
+    from retwin.monitor.promise import duration
     from retwin.update import DynamicsTwin
 
     check_place(out, folder=True, holds=("model.json", "weights.safetensors", "twin", "diagnoser"))
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     if kind_of(saved(model)) in catalog.DIAGNOSERS:
         require(
-            blanking is None,
-            "blanking",
+            lasting is None,
+            "lasting",
             expected="none for a diagnoser, whose monitor watches whole trajectories",
-            got=blanking,
+            got=lasting,
             remedy="leave it out",
         )
         _fit_trajectories(model, healthy, out, false_alarms, case, reading, as_json)
@@ -83,14 +87,18 @@ def fit(
         given = Trajectories.concatenate(records)
         checked = check_records(given)
         made = fit_monitor(
-            twin, given, false_alarms, blanking=60.0 if blanking is None else blanking
+            twin, given, false_alarms, lasting=3600.0 if lasting is None else lasting
         )
     made.save(out)
     promises = {name: str(each) for name, each in made.promises.items()}
+    tried = made.tried.text(twin.rate)
+    about = {"arl": made.arl, "run_length": made.run_length, "warm_up": made.warm_up}
     answer(
-        {"saved": str(out), "arl": made.arl, "warm_up": made.warm_up, "promises": promises}
+        {"saved": str(out), **about, "promises": promises, "tried": vars(made.tried)}
         | {"records": checked.values},
         *shown_records(checked),
+        f"Promised under the model: {duration(made.run_length / twin.rate)} to a false event.",
+        f"Tried: {tried}",
         *(f"{name}: {text}" for name, text in promises.items()),
         as_json=as_json,
     )
@@ -121,18 +129,16 @@ def replay(
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
         found.append((file, record, watched, causes))
-        for i, alarm in enumerate(watched.alarms):
-            cause = _written(causes[i]) if causes else ""
-            change = f"{alarm.output} {alarm.change}"
-            rows.append((file.name, alarm.trajectory, f"{alarm.time:.6g}", change, cause))
+        rows += [(file.name, *row) for row in _event_rows(watched, causes, record.rate)]
     answer(
         {
             "arl": made.arl,
             "promises": {name: str(each) for name, each in made.promises.items()},
             "records": [_json(*each) for each in found],
         },
-        *([table(("file", "record", "time in s", "what", "cause"), rows)] if rows else []),
+        *([table(EVENT, rows)] if rows else []),
         *(_summary(*each[:3]) for each in found),
+        _rates(made, [(each[1], each[2]) for each in found]),
         as_json=as_json,
     )
 
@@ -344,22 +350,64 @@ def _written(cause: Cause) -> str:
     return cause_text(cause.name, since, cause.unknown)
 
 
+def _event_rows(
+    watched: Watched, causes: Sequence[Cause], rate: float
+) -> list[tuple[str, str, str, str, str]]:
+    """Each event with its begin and end, and its causes as they became known."""
+    ends = {(each.trajectory, each.event): each for each in watched.endings}
+    rows = []
+    for first in watched.events:
+        names, before = [], -np.inf
+        for i, alarm in enumerate(watched.alarms):
+            if (alarm.trajectory, alarm.event) == (first.trajectory, first.event):
+                # A further one is of a second fault if that began after the alarm before.
+                if alarm.opens or (causes[i].name != HEALTHY and causes[i].onset[1] > before):
+                    names.append(_written(causes[i]))
+                before = alarm.time
+        end = ends.get((first.trajectory, first.event))
+        until = "lasts" if end is None else f"{end.sample / rate:.6g}"
+        what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
+        cause = "; then ".join(names)
+        rows.append((first.trajectory, f"{first.time:.6g}", until, what, cause))
+    return rows
+
+
 def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
     """What was watched, and whether the promise applied."""
     seconds = record.mask.any(axis=2).sum() / record.rate
-    void = sum(bool(each[-1]) for each in watched.void)
-    text = f"{file.name}: {len(watched.alarms)} alarms in {seconds / 3600:.3g} measured hours"
+    void = [float(each.argmax()) / record.rate for each in watched.void if each[-1]]
+    events = sum(each.promised for each in watched.events)
+    text = f"{file.name}: {events} events in {seconds / 3600:.3g} measured hours"
+    remarks = len(watched.events) - events
+    if remarks:
+        text += f", and {remarks} remarks where nothing is promised"
     if void:
         text += (
-            f"; in {void} of {len(record)} records the promise is VOID: the machine is not the one "
-            "of the calibration, so calibrate again"
+            f"; in {len(void)} of {len(record)} records the promise is VOID, since {min(void):.6g} "
+            "s: the machine is not the one of the calibration. If it is healthy, calibrate with "
+            "this record too"
         )
     if watched.outside.any():
         text += (
             f"; in {int(watched.outside.sum())} of {len(record)} records commands leave the range "
-            "of the calibration, where the twin extrapolates"
+            "of the calibration, where the twin extrapolates and nothing is promised"
         )
     return text + "."
+
+
+def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> str:
+    """The rate that was seen, with its exact bound, and the one that is promised."""
+    from retwin.monitor.promise import duration, shortest
+
+    rate = monitor.twin.rate
+    samples = sum(int(record.mask.any(axis=2).sum()) for record, _ in found)
+    events = sum(each.promised for _, watched in found for each in watched.events)
+    bound = duration(shortest(events, samples) / rate)
+    return (
+        f"Seen, if all was healthy: {events} events in {samples / rate / 3600:.3g} h, at most one "
+        f"in {bound} (exact 95 % bound). Promised under the model: at most one in "
+        f"{duration(monitor.run_length / rate)}."
+    )
 
 
 def _json(file: Path, record: Trajectories, watched: Watched, causes: list[Cause]) -> dict:
@@ -369,6 +417,8 @@ def _json(file: Path, record: Trajectories, watched: Watched, causes: list[Cause
     return {
         "file": str(file),
         "alarms": alarms,
+        "events": [vars(each) for each in watched.events],
+        "endings": [vars(each) for each in watched.endings],
         "void": [record.ids[i] for i, each in enumerate(watched.void) if each[-1]],
         "outside": [record.ids[i] for i, each in enumerate(watched.outside) if each],
         "measured_samples": int(record.mask.any(axis=2).sum()),

@@ -23,6 +23,7 @@ from retwin.twins.system_faults import (
     SensorFreeze,
     TimedFault,
 )
+from retwin.update.dynamics.online import moved
 from retwin.update.dynamics.twin import DynamicsTwin
 
 UNEXPLAINED = 0.5
@@ -210,7 +211,7 @@ def find_causes(
             else each
             for name, each in faults.items()
         }
-        made = StateInversionDiagnoser(twin, own).diagnose(
+        made = StateInversionDiagnoser(moved(twin, alarm.machine), own).diagnose(
             window, known_start=known_start and first == 0
         )
         best = int(made.probabilities[0].argmax())

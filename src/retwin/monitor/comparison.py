@@ -87,17 +87,17 @@ def _compared_streams(
             continue
         commands, measured = np.split(part[None], [len(old.twin.inputs)], axis=2)
         seen = [each.step(each.start(1), commands, measured)[1] for each in (old, new)]
-        if seen[0].alarms:  # an alarm that was not raised when the samples came, after another one
+        if seen[0].events:  # an alarm that was not raised when the samples came, after another one
             continue
         known = np.where(np.isfinite(seen[0].score) & np.isfinite(seen[1].score), measured, np.nan)
         unit = np.nanstd(measured, axis=1, keepdims=True)
         unit = np.where(unit > 0, unit, 1.0)
         found = [crps_normal(known, each.mean, each.deviation) for each in seen]
         scores.append([_mean((each / unit)[0]) for each in found])
-        alarms += len(seen[1].alarms)
+        alarms += len(seen[1].events)
         if reference is not None:
             seen = [reference.step(reference.start(1), commands, measured)[1]]
-            of_reference += len(seen[0].alarms)
+            of_reference += len(seen[0].events)
     require(
         scores,
         "samples",
@@ -125,7 +125,7 @@ def _mean(scores: NDArray) -> NDArray:
 def _healthy(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
     """The healthy samples (T, d_u + d_y) of each asset of a twin."""
     alarms: dict[str, list[int]] = {}
-    for entry in store.log("alarm"):
+    for entry in (*store.log("alarm"), *store.log("remark"), *store.log("end")):
         alarms.setdefault(entry.data["asset"], []).append(entry.data["time"])
     for asset in store.assets():
         newest = store.state(asset.name)

@@ -46,9 +46,6 @@ DURATION = 86_400.0
 """Time in s by which the streams begin in the past, so that they are never ahead of the clock."""
 PAUSE, SHADOW = 0.1, 15.0
 """Seconds between two batches of samples, and until a second version of the twin is fitted."""
-BLANKING = 2700.0
-"""Time in s after an alarm without another one: faults last 900 s, and the prediction of a machine
-that was disturbed so much needs another half an hour, in which alarms would have no cause."""
 LENGTH = 2 * DURATION
 """Time in s that is emulated: with the clock it takes a day after the streams have caught up."""
 OPEN, OFFSET, WEAK, LASTING = 2400.0, 9000.0, 15600.0, 900.0
@@ -119,7 +116,7 @@ def fitted(hours: float, seed: int) -> Monitor:
     wide, terms = 0.3, Dynamics(Library(1, (), friction=False), memory=False, folds=4)
     corrected = fit_dynamics(INCUBATOR, emulated(3600 * hours, seed, heater=wide), terms).twin
     healthy = emulated(3600.0, seed + 1, (None,) * 3, heater=wide)
-    return fit_monitor(corrected, healthy, "1 per month", blanking=BLANKING)
+    return fit_monitor(corrected, healthy, "1 per month")
 
 
 @contextmanager

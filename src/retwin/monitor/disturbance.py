@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,7 @@ ROUNDS = 14
 """Rounds of the pattern search; a failed one halves the step of a stream."""
 RATIOS = (-12.0, 12.0)
 """Limits of that logarithm, beyond which one of the noises is negligible."""
-BLOCK = 1000
+BLOCK = 500
 """A longer record is estimated as independent blocks of so many samples, all at once."""
 MIN_RESIDUALS = 50
 """Measured residuals per stream, at least."""
@@ -128,7 +128,9 @@ class Disturbance:
         return made, errors.T, deviation.T
 
 
-def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) -> Disturbance:
+def fit_disturbance(
+    residual: ArrayLike, *, max_order: int = 3, folds: int | Sequence[NDArray] = 4
+) -> Disturbance:
     """Estimate the autoregression of residuals of a healthy machine, by maximum likelihood.
 
     Parameters
@@ -138,8 +140,9 @@ def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) 
     max_order : int
         Largest order of the autoregression, from 1 to 6; each stream has the order of the least
         Bayesian information criterion.
-    folds : int
-        Blocks of samples of which each is predicted with the parameters of the others.
+    folds : int or sequence of NDArray
+        Number of blocks of samples of which each is predicted with the parameters of the others,
+        or the samples of each block.
 
     Returns
     -------
@@ -148,7 +151,6 @@ def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) 
 
     """
     whole("max_order", max_order, least=1, most=6)
-    whole("folds", folds, least=2)
     given = np.asarray(residual, dtype=float)
     given = np.where(np.abs(given) < 1e100, given, np.nan)
     seen = ~np.isnan(given)
@@ -167,13 +169,14 @@ def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) 
         got=f"a constant in stream {np.argmin(scale)}",
         remedy="leave out a channel that does not move",
     )
-    folded = np.array_split(np.arange(given.shape[1]), folds)
-    fewest = min((seen.sum(axis=1) - seen[:, each].sum(axis=1)).min() for each in folded)
+    if isinstance(folds, int):
+        folds = np.array_split(np.arange(given.shape[1]), whole("folds", folds, least=2))
+    fewest = min((seen.sum(axis=1) - seen[:, each].sum(axis=1)).min() for each in folds)
     enough = MIN_RESIDUALS // 2
     require(
         fewest >= enough,
         "residual",
-        expected=f"at least {enough} residuals outside each of {folds} parts of the record",
+        expected=f"at least {enough} residuals outside each of {len(folds)} parts of the record",
         got=str(fewest),
         remedy="leave out the parts of the record in which nothing was measured",
     )
@@ -181,7 +184,7 @@ def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) 
     blocks = _blocks(values)
     point = _orders(blocks, max_order)
     errors, deviation = np.full((2, *values.shape), np.nan)
-    for block in folded:
+    for block in folds:
         part = values.copy()
         part[block] = np.nan
         parts = _blocks(part)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from retwin.checks import require
-from retwin.data.trajectories import UNKNOWN
+from retwin.data.trajectories import HEALTHY, UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.audit import Entry
 from retwin.monitor.cause import BEFORE, MIN_WINDOW, Cause, cause_data, find_causes, possible_causes
@@ -30,7 +30,9 @@ Faults = Callable[[str], "dict[str, Fault | None] | None"]
 class Explanations:
     """A thread that explains each alarm from the stored samples before it.
 
-    A context manager that ends the thread. What is found is an entry `cause` of the log. Alarms
+    A context manager that ends the thread. What is found is an entry `cause` of the log. Of further
+    alarms of an event it is a second fault if it began after the alarm before; else the fault is
+    still the `same`, or its state comes back. Alarms
     that have none, since the program was stopped, are explained when it is started again.
 
     Parameters
@@ -121,7 +123,11 @@ class Explanations:
             found = _data(*self._found(alarm, before))
         except Exception as error:  # Whatever fails is an entry, and the next alarm is explained.
             found = cause_data(UNKNOWN, 0.0, 1.0, {}) | {"note": brief(error)}
-        found |= {"alarm": entry.sequence, "asset": alarm["asset"]}
+        begun = found["onset"][1]
+        same = alarm.get("event", alarm["time"]) != alarm["time"] and (
+            found["name"] == HEALTHY or begun is None or begun <= before
+        )
+        found |= {"alarm": entry.sequence, "asset": alarm["asset"], "same": same}
         self._live.log([("cause", found)])
         try:
             self._report(alarm, found)
@@ -148,7 +154,8 @@ class Explanations:
             remedy="store more of them: see max_samples",
         )
         record = record_of(monitor.twin, values)
-        own = Alarm("", record.steps - 1, 0.0, alarm["output"], alarm["change"], alarm["evidence"])
+        about = alarm["output"], alarm["change"], alarm["evidence"]
+        own = Alarm("", record.steps - 1, 0.0, *about, 0, True, tuple(alarm["machine"]))
         known = self.causes(twin, monitor)
         (cause,) = find_causes(monitor.twin, record, [own], known, known_start=False)
         return cause, int(times[0])

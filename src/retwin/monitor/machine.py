@@ -96,12 +96,12 @@ class Machine(ABC, Generic[Watching]):
     evidence : float
         That of a change, after the newest sample.
     alarms : int
-        Alarms since the program was started.
+        Events since the program was started.
     last_alarm : int or None
-        Time of the last one of these.
-    void, outside : bool
-        Whether the promise does not apply any more, and whether commands have left their range in
-        calibration.
+        Time of the begin of the last one of these.
+    event, void, outside : bool
+        Whether an event lasts, whether the promise does not apply any more, and whether commands
+        have left their range in calibration.
 
     """
 
@@ -113,7 +113,7 @@ class Machine(ABC, Generic[Watching]):
         self.evidence = 0.0
         self.alarms = 0
         self.last_alarm: int | None = None
-        self.void = self.outside = False
+        self.event = self.void = self.outside = False
 
     @property
     def rate(self) -> str:

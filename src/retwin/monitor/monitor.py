@@ -5,35 +5,42 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.arrays import held
-from retwin.checks import finite, require
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.detector import Detector
-from retwin.monitor.disturbance import Disturbance
+from retwin.monitor.disturbance import Disturbance, DisturbanceState
+from retwin.monitor.events import CHANGED, FOLLOWS, Course, Rules
 from retwin.monitor.monitor_state import MonitorState
-from retwin.monitor.predictors import Predictor, standardised
-from retwin.monitor.promise import Promise
+from retwin.monitor.noise import DECAYS, Noise, features, own_scale
+from retwin.monitor.parts import Part, Streams
+from retwin.monitor.predictors import (
+    Predictor,
+    by_machine,
+    by_output,
+    by_stream,
+    finite_state,
+    implausible,
+    span_of,
+    standardised,
+)
+from retwin.monitor.promise import Promise, Tried
+from retwin.monitor.saved import read_fields, write_fields
 from retwin.monitor.scores import ConformalScores, middle
 from retwin.monitor.slack import Slack
 from retwin.monitor.validity import Validity
-from retwin.monitor.watched import Alarm, Watched
-from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.monitor.watched import Alarm, Ending, Watched
 from retwin.twins.twin import check_channels
-from retwin.update.dynamics.online import FilterState, OnlineFilter
-from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.online import OnlineFilter
+from retwin.update.dynamics.twin import BEYOND, DynamicsTwin
 
-KIND = "monitor"
-"""Kind of the saved model."""
-IMPLAUSIBLE = 100.0
-"""Ranges of a command in calibration by which it may leave that range. What is farther away stands
-for a missing one, such as 1e9 or 3.4e38; a filter that took it for real would predict nothing until
-the states have decayed from there."""
+SIZE = 256
+"""Samples that are predicted at once: those after an alarm are predicted again. While an event
+lasts, where alarms are frequent, an eighth of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +68,12 @@ class Monitor:
         (d_y,), the steps to which the outputs are rounded; 0 for none.
     arl : float
         Average number of measured samples to a false alarm, at least.
-    blanking : float
-        Time in s after an alarm in which none is raised.
+    noise : Noise
+        What the errors of the disturbance's predictions depend on.
+    tried : Tried
+        What happened on the records of the calibration, each left out in turn.
+    lasting : float
+        Time in s after which an event that has not ended is a change.
     alpha : float
         Probability of declaring a promise void that applies.
     predictors : tuple of Predictor
@@ -76,7 +87,9 @@ class Monitor:
     slack: tuple[Slack, ...]
     resolution: NDArray
     arl: float
-    blanking: float = 0.0
+    noise: Noise
+    tried: Tried
+    lasting: float = 3600.0
     alpha: float = 0.01
     predictors: tuple[Predictor, ...] = (Predictor(),)
 
@@ -91,7 +104,7 @@ class Monitor:
         outputs = self.twin.outputs.names
         return {
             name: Promise(
-                self.arl,
+                self.run_length,
                 self.twin.rate,
                 self.slack[i],
                 self.alpha,
@@ -100,17 +113,22 @@ class Monitor:
             for i, name in enumerate(outputs)
         }
 
+    @property
+    def run_length(self) -> float:
+        """The average run length that is promised: the one that is wanted, if it held there."""
+        return self.arl if self.tried.kept(self.arl) else min(self.arl, self.tried.run_length)
+
     def start(self, count: int) -> MonitorState:
         """What is known of so many machines before their first sample."""
         streams = self._streams(count)
-        zeros = np.zeros(count, dtype=np.int64)
         return MonitorState(
             tuple(each.start(count) for each in self._filters),
             streams.disturbance.start(),
             streams.detector.start(count * len(self.slack)),
             streams.validity.start(count * len(self.slack)),
-            zeros,
-            zeros,
+            Course.start(count),
+            np.zeros((count, len(DECAYS), len(self.twin.inputs))),
+            np.zeros((count * len(self.slack), 2)),
             np.zeros(count, dtype=bool),
         )
 
@@ -147,43 +165,25 @@ class Monitor:
             got=f"shapes {commands.shape} and {measured.shape}",
             remedy="give arrays (machines, samples, channels)",
         )
-        seen = np.isfinite(measured)
         known = self._held(state, commands)
-        predicted = [
-            online.step(own, known, measured, seen)
-            for online, own in zip(self._filters, state.filters, strict=True)
-        ]
-        parts = (
-            standardised(measured - mean, covariance, seen, self.resolution)
-            for _, mean, covariance in predicted
-        )
-        pairs = zip(*parts, strict=True)
-        error, width = (_by_stream(np.concatenate(each, axis=2)) for each in pairs)
-        streams = self._streams(count)
-        disturbance, error, scale = streams.disturbance.run(state.disturbance, error)
-        width = width / scale
-        low, high = self.scores.score(_by_output(error, count), _by_output(width, count))
-        low, high = (_by_stream(_by_machine(each, count)) for each in (low, high))
-        outputs, rate = len(self.twin.outputs), self.twin.rate
-        counted = np.stack([p.used(state.samples, samples, rate) for p in self.predictors], axis=1)
-        counted = np.repeat(counted, outputs, axis=1).reshape(low.shape)
-        low, high = (np.where(counted, each, np.nan) for each in (low, high))
-        filters = tuple(
-            _finite(online, filtered)
-            for online, (filtered, _, _) in zip(self._filters, predicted, strict=True)
-        )
-        finite_ = [np.isfinite(each).all(axis=(1, 2)) for _, each, _ in predicted]
-        void = state.void | ~np.all(finite_, axis=0)
-        state = replace(state, filters=filters, disturbance=disturbance, void=void)
-        state, found = self._detected(streams, state, low, high, list(np.asarray(ids, dtype=str)))
-        state = replace(state, samples=state.samples + samples)
-        evidence, alarm, void, alarms = found
-        _, mean, covariance = predicted[0]
-        deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
-        shape = (count, len(self.slack), samples)
-        score = np.moveaxis(middle(low, high).reshape(shape)[:, :outputs], 1, 2)
-        outside = self.twin.outside(known) | self._implausible(commands).any(axis=(1, 2))
-        return state, Watched(mean, deviation, score, evidence, alarm, void, outside, alarms)
+        names = list(np.asarray(ids, dtype=str)) or [""] * count
+        alarms, endings, parts, first = list[Alarm](), list[Ending](), [], 0
+        while first < samples:
+            calm = (state.course.event < 0).all()
+            size = min(SIZE if calm else SIZE // 8, samples - first)
+            own = [each[:, first : first + size] for each in (known, measured)]
+            part = self._part(state, *own)
+            if (until := part.until) < size:  # the machine begins anew after the first alarm
+                part = self._part(state, *(each[:, :until] for each in own))
+            state, shown = self._after(state, part, names, alarms, endings)
+            parts.append(shown)
+            first += part.until
+        shown = tuple(np.concatenate(each, axis=1) for each in zip(*parts, strict=True))
+        mean, deviation, score, evidence, alarm, event, void = shown
+        far = implausible(self.twin, commands).any(axis=2)
+        outside = np.asarray((self._outside(known) | far).any(axis=1))
+        flags = alarm, event, void, outside
+        return state, Watched(mean, deviation, score, evidence, *flags, alarms, endings)
 
     def watch(self, record: Trajectories) -> Watched:
         """Watch recorded trajectories, each as a machine of its own.
@@ -198,71 +198,161 @@ class Monitor:
         measured = np.where(record.mask, record.observed, np.nan)
         return self.step(self.start(len(record)), record.commands, measured, record.ids)[1]
 
-    def _detected(
+    @property
+    def rules(self) -> Rules:
+        """When events begin and end."""
+        return Rules.of(self.arl, max(1, round(self.lasting * self.twin.rate)))
+
+    def _part(self, state: MonitorState, commands: NDArray, measured: NDArray) -> Part:
+        """What is found in samples (n, T, ...) if none of the machines begins anew in them."""
+        count, samples = measured.shape[:2]
+        seen, learn = np.isfinite(measured), state.course.event < 0
+        predicted = [
+            online.step(own, commands, measured, seen, learn)
+            for online, own in zip(self._filters, state.filters, strict=True)
+        ]
+        pairs = zip(
+            *(
+                standardised(measured - mean, covariance, seen, self.resolution)
+                for _, mean, covariance in predicted
+            ),
+            strict=True,
+        )
+        error, width = (by_stream(np.concatenate(each, axis=2)) for each in pairs)
+        streams = self._streams(count)
+        disturbance, error, scale = streams.disturbance.run(state.disturbance, error)
+        _, mean, covariance = predicted[0]
+        before, level = state.filters[0].commands[:, -1], np.nan_to_num(mean)
+        changes, noted = features(state.changes, before, commands, level, span_of(self.twin))
+        shift, spread = (by_stream(each) for each in self.noise.run(noted))
+        error, width = (error - shift) / spread, width / scale / spread
+        calm = np.repeat(learn, len(self.slack))
+        own, sums = own_scale(state.scale, error, np.tile(self.noise.degrees, count))
+        sums = np.where(calm[:, None], sums, state.scale)
+        own = np.where(calm[:, None], own, own[:, :1])
+        error, width = error / own, width / own
+        low, high = self.scores.score(by_output(error, count), by_output(width, count))
+        low, high = (by_stream(by_machine(each, count)) for each in (low, high))
+        since, rate = state.course.samples - state.course.begun, self.twin.rate
+        used = np.stack([each.used(since, samples, rate) for each in self.predictors], axis=1)
+        used = np.repeat(used, len(self.twin.outputs), axis=1).reshape(low.shape)
+        low, high = (np.where(used, each, np.nan) for each in (low, high))
+        detector, evidence = streams.detector.run(state.detector, low, high)
+        total = evidence.reshape(count, len(self.slack), -1).mean(axis=1)
+        counted = np.isfinite(low).reshape(count, len(self.slack), -1).any(axis=1)
+        rules = self.rules
+        alarm = rules.alarms(total)
+        ended = rules.ends(state.course, total, counted) & ~alarm
+        outside = self._outside(commands)
+        changed = rules.changes(state.course, samples) & ~ended
+        filters = tuple(
+            finite_state(online, filtered)
+            for online, (filtered, _, _) in zip(self._filters, predicted, strict=True)
+        )
+        finite_ = np.all([np.isfinite(each).all(axis=(1, 2)) for _, each, _ in predicted], axis=0)
+        after = replace(
+            state,
+            filters=filters,
+            disturbance=disturbance,
+            detector=detector,
+            changes=changes,
+            scale=sums,
+            void=state.void | ~finite_,
+        )
+        deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
+        flags = alarm, ended, changed, counted, outside
+        return Part(after, mean, deviation, low, high, evidence, total, *flags)
+
+    def _after(
         self,
-        streams: _Streams,
         state: MonitorState,
-        low: NDArray,
-        high: NDArray,
-        ids: list[str],
-    ) -> tuple[MonitorState, tuple[NDArray, NDArray, NDArray, list[Alarm]]]:
-        """Evidence and alarms of scores (n * d_y, T): the detector begins anew after each alarm."""
-        count, samples = len(state.void), low.shape[1]
-        each = len(self.slack)
-        evidence, alarm = np.zeros((count, samples)), np.zeros((count, samples), dtype=bool)
-        void, alarms, first = alarm.copy(), [], 0
-        pause = round(self.blanking * self.twin.rate)
-        while first < samples:
-            # The scores up to the next alarm, and of a machine that pauses none.
-            number = np.arange(samples - first)
-            paused = np.repeat(state.blank[:, None] > number, each, axis=0)
-            part = [np.where(paused, np.nan, own[:, first:]) for own in (low, high)]
-            detector, found = streams.detector.run(state.detector, *part)
-            total = found.reshape(count, each, -1).mean(axis=1)
-            raised = total >= self.arl
-            ends = np.flatnonzero(raised.any(axis=0))
-            last = int(ends[0]) + 1 if len(ends) else samples - first
-            if last < samples - first:
-                part = [own[:, :last] for own in part]
-                detector, found = streams.detector.run(state.detector, *part)
-            here = slice(first, first + last)
-            evidence[:, here], alarm[:, here] = total[:, :last], raised[:, :last]
-            now = raised[:, last - 1]
-            flags = np.repeat(raised[:, :last], each, axis=0)
-            validity, against = streams.validity.run(state.validity, flags, *part)
-            broken = against.reshape(count, each, -1).mean(axis=1) >= 1 / self.alpha
-            void[:, here] = np.logical_or.accumulate(broken, axis=1) | state.void[:, None]
-            for machine in np.flatnonzero(now):
-                sample = int(state.samples[machine]) + first + last - 1
-                rows = slice(machine * each, (machine + 1) * each)
-                output = int(np.argmax(found[rows, -1]))
-                chosen = int(
-                    np.argmax(detector.evidence[rows][output] * streams.detector.bets.weights)
+        part: Part,
+        names: list[str],
+        alarms: list[Alarm],
+        endings: list[Ending],
+    ) -> tuple[MonitorState, tuple[NDArray, ...]]:
+        """The state after a part whose last sample may have alarms or ends of events."""
+        each, course, after = len(self.slack), state.course, part.after
+        alarm, ended, changed = (own[:, -1] for own in (part.alarm, part.ended, part.changed))
+        opens = alarm & (course.event < 0)
+        # Only outside of events, and in the range of the calibration, is something promised.
+        calm = np.repeat((course.event < 0)[:, None] & ~part.outside, each, axis=0)
+        low, high = (np.where(calm, own, np.nan) for own in (part.low, part.high))
+        flags = np.zeros(low.shape, dtype=bool)
+        flags[:, -1] = np.repeat(opens & ~part.outside[:, -1], each)
+        streams = self._streams(len(alarm))
+        validity, against = streams.validity.run(state.validity, flags, low, high)
+        broken = against.reshape(len(alarm), each, -1).mean(axis=1) >= 1 / self.alpha
+        void = np.logical_or.accumulate(broken, axis=1) | after.void[:, None]
+        lasts = np.repeat((course.event >= 0)[:, None], void.shape[1], axis=1)
+        lasts[opens, -1] = True
+        course = self.rules.after(course, part.counted, alarm, ended, changed)
+        for machine in np.flatnonzero(alarm):
+            rows = slice(machine * each, (machine + 1) * each)
+            stream = int(np.argmax(part.evidence[rows, -1]))
+            weighed = after.detector.evidence[rows][stream] * streams.detector.bets.weights
+            sample = int(course.samples[machine]) - 1
+            outputs = self.twin.outputs.names
+            alarms.append(
+                Alarm(
+                    names[machine],
+                    sample,
+                    sample / self.twin.rate,
+                    outputs[stream % len(outputs)],
+                    streams.detector.change(int(np.argmax(weighed))),
+                    float(part.total[machine, -1]),
+                    sample if opens[machine] else int(state.course.event[machine]),
+                    not (void[machine, -1] or part.outside[machine, -1]),
+                    tuple(after.filters[0].centre[machine].tolist()),
                 )
-                alarms.append(
-                    Alarm(
-                        ids[machine] if ids else str(machine),
-                        sample,
-                        sample / self.twin.rate,
-                        self.twin.outputs.names[output % len(self.twin.outputs)],
-                        streams.detector.change(chosen),
-                        float(total[machine, last - 1]),
-                    )
-                )
-            state = replace(
-                state,
-                detector=streams.detector.reset(detector, np.repeat(now, each)),
-                validity=validity,
-                blank=np.where(now, pause, np.maximum(state.blank - last, 0)),
-                void=void[:, first + last - 1],
             )
-            first += last
-        return state, (evidence, alarm, void, alarms)
+        for machine in np.flatnonzero(ended | changed):
+            how = FOLLOWS if ended[machine] else CHANGED
+            event, sample = int(state.course.event[machine]), int(course.samples[machine]) - 1
+            endings.append(Ending(names[machine], event, sample, how))
+        after = replace(after, validity=validity, course=course, void=void[:, -1])
+        count = len(self.twin.outputs)
+        score = middle(part.low, part.high).reshape(len(alarm), each, -1)[:, :count]
+        shown = part.mean, part.deviation, np.moveaxis(score, 1, 2), part.total, part.alarm
+        return self._anew(after, alarm | changed, ended, changed), (*shown, lasts, void)
+
+    def _anew(
+        self, state: MonitorState, anew: NDArray, ended: NDArray, changed: NDArray
+    ) -> MonitorState:
+        """The state where filter and detector begin anew; after a change with another machine."""
+        streams, each = self._streams(len(anew)), len(self.slack)
+        detector = streams.detector.reset(state.detector, np.repeat(anew | ended, each))
+        if not anew.any():
+            return replace(state, detector=detector)
+        rows, first = np.flatnonzero(anew), streams.disturbance.start()
+        filters = []
+        for online, own in zip(self._filters, state.filters, strict=True):
+            new, old = online.start(len(rows)), own.of(rows)
+            kept = {name: getattr(old, name) for name in ("commands", "simulated")}
+            learned = ~changed[rows]
+            for name in ("centre", "root"):
+                values = getattr(new, name)
+                values[learned] = getattr(old, name)[learned]
+                kept[name] = values
+            filters.append(own.merged(rows, replace(new, **kept)))
+        where = np.repeat(anew, each)
+        scale = np.where(np.repeat(changed, each)[:, None], 0.0, state.scale)
+        disturbance = DisturbanceState(
+            np.where(where[:, None], first.mean, state.disturbance.mean),
+            np.where(where[:, None, None], first.covariance, state.disturbance.covariance),
+        )
+        return replace(
+            state,
+            filters=tuple(filters),
+            disturbance=disturbance,
+            detector=detector,
+            scale=scale,
+        )
 
     def _held(self, state: MonitorState, commands: NDArray) -> NDArray:
         """Commands (n, T, d_u), where those that are missing or implausible are as before."""
         given = np.concatenate([state.filters[0].commands[:, -1:], commands], axis=1)
-        known = held(np.where(self._implausible(given), np.nan, given), 1)
+        known = held(np.where(implausible(self.twin, given), np.nan, given), 1)
         # Without a plausible one before, an implausible one is all that is known.
         known = np.where(np.isfinite(known), known, held(given, 1))[:, 1:]
         require(
@@ -274,124 +364,34 @@ class Monitor:
         )
         return known
 
-    def _implausible(self, commands: NDArray) -> NDArray:
-        """Whether commands (n, T, d_u) are so far from those of the calibration."""
-        domain, states = self.twin.domain, len(self.twin.process)
-        low, high = domain.low[states:], domain.high[states:]
-        largest = np.maximum(high - low, np.maximum(np.abs(low), np.abs(high)))
-        far = IMPLAUSIBLE * np.where(largest > 0, largest, np.inf)
-        return np.isfinite(commands) & ((commands < low - far) | (commands > high + far))
+    def _outside(self, commands: NDArray) -> NDArray:
+        """Whether commands (n, T, d_u) leave their range in both calibrations, (n, T)."""
+        low, high = (each[len(self.twin.process) :] for each in self.twin.bounds)
+        least, largest = (each[: len(low)] for each in (self.noise.low, self.noise.high))
+        margin = BEYOND * (largest - least)
+        low, high = np.minimum(low, least - margin), np.maximum(high, largest + margin)
+        return np.asarray(((commands < low) | (commands > high)).any(axis=2))
 
     @cached_property
     def _filters(self) -> tuple[OnlineFilter, ...]:
         return tuple(each.filter(self.twin) for each in self.predictors)
 
     @cached_property
-    def _by_count(self) -> dict[int, _Streams]:
+    def _by_count(self) -> dict[int, Streams]:
         """The parts for each number of machines that was used: their tables take long to make."""
         return {}
 
-    def _streams(self, count: int) -> _Streams:
+    def _streams(self, count: int) -> Streams:
         if count not in self._by_count:
-            self._by_count[count] = _Streams.of(self, count)
+            validity = Validity(Detector(self.slack), self.run_length, self.alpha)
+            self._by_count[count] = Streams.of(self.disturbance, validity, count)
         return self._by_count[count]
 
     def save(self, folder: str | Path) -> None:
         """Write the twin, the calibration and the promise."""
-        about = {
-            "slack": [[each.kappa, each.shift] for each in self.slack],
-            "copies": self.scores.copies,
-            "predictors": [[each.process, each.warm_up] for each in self.predictors],
-            **{name: getattr(self, name) for name in NUMBERS},
-        }
-        arrays = {name: getattr(self.disturbance, name) for name in DISTURBANCE}
-        arrays |= self.scores.arrays()
-        arrays["resolution"] = self.resolution
-        tensors = {name: torch.tensor(np.ascontiguousarray(each)) for name, each in arrays.items()}
-        with write_model(folder, KIND, about, tensors) as temporary:
-            self.twin.save(temporary / "twin")
+        write_fields(folder, vars(self))
 
     @classmethod
     def load(cls, folder: str | Path) -> Monitor:
         """Read what `save` wrote. Raises InputError if it is no monitor or is damaged."""
-        about, weights = read_model(folder, KIND)
-        with refusing(folder, expected="a monitor"):
-            arrays = {name: each.numpy() for name, each in weights.items()}
-            nothing = np.zeros((len(arrays["mean"]), 0))
-            own = {name: arrays[name] for name in DISTURBANCE}
-            disturbance = Disturbance(**own, held_out=nothing, deviation=nothing)
-            scores = ConformalScores.of_arrays(arrays, about["copies"])
-            slack = tuple(Slack(*each) for each in about["slack"])
-            twin = DynamicsTwin.load(Path(folder) / "twin")
-            numbers: dict[str, Any] = {
-                name: finite(name, about[name], least=0.0) for name in NUMBERS
-            }
-            predictors = tuple(Predictor(*each) for each in about["predictors"])
-            streams = len(predictors) * len(twin.outputs)
-            parts = (disturbance.mean, scores.independent, slack, arrays["resolution"])
-            shapes = [len(each) for each in parts]
-            require(
-                shapes == [streams] * 3 + [len(twin.outputs)]
-                and np.isfinite(disturbance.coefficients).all()
-                and (disturbance.process > 0).all()
-                and (disturbance.measurement >= 0).all(),
-                "weights",
-                expected=f"the calibration of {len(twin.outputs)} outputs",
-                got=shapes,
-                remedy="save the monitor again",
-            )
-            numbers |= {"resolution": arrays["resolution"], "predictors": predictors}
-            return cls(twin, disturbance, scores, slack, **numbers)
-
-
-NUMBERS = ("arl", "blanking", "alpha")
-"""Attributes of a monitor that are saved as numbers."""
-DISTURBANCE = ("coefficients", "mean", "process", "measurement")
-"""Attributes of the disturbance that are saved as arrays."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Streams:
-    """The parts of a monitor for the outputs of so many machines."""
-
-    disturbance: Disturbance
-    detector: Detector
-    validity: Validity
-
-    @classmethod
-    def of(cls, monitor: Monitor, count: int) -> _Streams:
-        repeated = {
-            name: np.concatenate([getattr(monitor.disturbance, name)] * count)
-            for name in DISTURBANCE
-        }
-        detector = Detector(monitor.slack * count)
-        return cls(
-            replace(monitor.disturbance, **repeated),
-            detector,
-            Validity(detector, monitor.arl, monitor.alpha),
-        )
-
-
-def _finite(online: OnlineFilter, state: FilterState) -> FilterState:
-    """The state of a filter, begun anew where it is not finite."""
-    kept = np.isfinite(state.states).all(axis=1) & np.isfinite(state.spread).all(axis=(1, 2))
-    lost = np.flatnonzero(~kept)
-    if not len(lost):
-        return state
-    return state.merged(lost, replace(online.start(len(lost)), commands=state.commands[lost]))
-
-
-def _by_stream(values: NDArray) -> NDArray:
-    """(n * d_y, T) of (n, T, d_y)."""
-    return np.moveaxis(values, 2, 1).reshape(-1, values.shape[1])
-
-
-def _by_output(values: NDArray, count: int) -> NDArray:
-    """(d_y, n * T) of (n * d_y, T)."""
-    parted = values.reshape(count, -1, values.shape[1])
-    return np.moveaxis(parted, 1, 0).reshape(parted.shape[1], -1)
-
-
-def _by_machine(values: NDArray, count: int) -> NDArray:
-    """(n, T, d_y) of (d_y, n * T)."""
-    return np.moveaxis(values.reshape(len(values), count, -1), 0, 2)
+        return cls(**read_fields(folder))

@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 
 from retwin.monitor.detector import DetectorState
 from retwin.monitor.disturbance import DisturbanceState
+from retwin.monitor.events import Course
 from retwin.monitor.validity import ValidityState
 from retwin.update.dynamics.online import FilterState
 
-PARTS = {
-    "disturbance": DisturbanceState,
-    "detector": DetectorState,
-    "validity": ValidityState,
-}
-"""What the state of a monitor consists of, beside the filters."""
+PARTS = ("disturbance", "detector", "validity")
+"""What the state of a monitor has of each stream."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +29,12 @@ class MonitorState:
     disturbance, detector, validity
         Of n * M * d_y streams: those of the first machine first, and of these the d_y outputs of
         the first of M predictive models.
-    samples, blank : NDArray
-        (n,), samples since the start, and samples for which no alarm is raised any more.
+    course : Course
+        Samples, and the event that lasts, of the n machines.
+    changes : NDArray
+        (n, 3, d_u), changes of commands that are remembered; see `features`.
+    scale : NDArray
+        (n * M * d_y, 2), of the noise of each stream; see `own_scale`.
     void : NDArray
         (n,) bool, whether the promise does not apply to the machine.
 
@@ -43,8 +44,9 @@ class MonitorState:
     disturbance: DisturbanceState
     detector: DetectorState
     validity: ValidityState
-    samples: NDArray
-    blank: NDArray
+    course: Course
+    changes: NDArray
+    scale: NDArray
     void: NDArray
 
     def arrays(self) -> dict[str, NDArray]:
@@ -60,7 +62,9 @@ class MonitorState:
                 array = getattr(value, each.name)
                 array = array.reshape(len(self.void), -1, *array.shape[1:])
                 found[f"{name}.{each.name}"] = array
-        return found | {name: getattr(self, name) for name in ("samples", "blank", "void")}
+        found |= {f"course.{each.name}": getattr(self.course, each.name) for each in fields(Course)}
+        scale = self.scale.reshape(len(self.void), -1, 2)
+        return found | {"changes": self.changes, "scale": scale, "void": self.void}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, NDArray]) -> MonitorState:
@@ -68,15 +72,20 @@ class MonitorState:
 
         def part(name: str, kind: Any) -> Any:
             own = {each.name: arrays[f"{name}.{each.name}"] for each in fields(kind)}
-            if kind is not FilterState:
+            if name in PARTS:  # one row per stream
                 own = {key: each.reshape(-1, *each.shape[2:]) for key, each in own.items()}
             return kind(**own)
 
         filters = takewhile(lambda name: f"{name}.states" in arrays, map(_filter, count()))
         return cls(
             tuple(part(name, FilterState) for name in filters),
-            *(part(name, kind) for name, kind in PARTS.items()),
-            *(arrays[name] for name in ("samples", "blank", "void")),
+            part("disturbance", DisturbanceState),
+            part("detector", DetectorState),
+            part("validity", ValidityState),
+            part("course", Course),
+            arrays["changes"],
+            arrays["scale"].reshape(-1, 2),
+            arrays["void"],
         )
 
 

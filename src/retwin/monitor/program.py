@@ -46,6 +46,8 @@ from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.serialisation.files import sha256
 from retwin.twins.faults import Fault
 
+REMEDY = "If it is healthy, recalibrate: what follows are remarks, and no alarms, until then"
+"""What to do where a promise is void."""
 INTERVAL = 0.5
 """Seconds after which new entries of the log are reported."""
 
@@ -126,16 +128,21 @@ def described(entry: Entry) -> str:
         return f"twin {data['twin']}: {data['step']} version {data['version']}{reason}"
     if entry.kind == "cause":
         onset = data["onset"][0]
+        if data.get("same"):
+            return ""  # the event has its cause
         found = cause_text(data["name"], "" if onset is None else _moment(onset), data["unknown"])
         text = f"cause of alarm {data['alarm']}: {found}"
         return f"{data['asset']}: {text} (probability {data['probability']:.2f})"
     texts = {
         "alarm": "ALARM {sequence}: {output}, {change}",
-        "void": "promise VOID: the machine is not the one of the calibration, so calibrate again",
+        "remark": "remark, for which nothing is promised: {output}, {change}",
+        "end": "event ended, {how}",
+        "void": "promise VOID: the machine is not the one of the calibration. " + REMEDY,
         "event": "{text}",
     }
-    if entry.kind not in texts:
-        return ""
+    opens = data.get("event", data.get("time")) == data.get("time")
+    if entry.kind not in texts or not (opens or entry.kind == "end"):
+        return ""  # an event is one line, though more alarms belong to it
     text = texts[entry.kind].format(sequence=entry.sequence, **data)
     if "cause" in data:
         name, probability = cause_title(data["cause"]["name"]), data["cause"]["probability"]

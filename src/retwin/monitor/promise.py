@@ -8,6 +8,7 @@ from numbers import Real
 
 from retwin.checks import finite
 from retwin.errors import InputError
+from retwin.monitor.decision import FalseAlarmTest
 from retwin.monitor.slack import Slack
 from retwin.times import sample_rate
 
@@ -89,6 +90,51 @@ def false_alarms(wanted: str | float, rate: float) -> float:
         unit="samples from one false alarm to the next, on average",
         remedy=f"{remedy}; a bare number counts samples",
     )
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What happened on the records of the calibration, each watched by the others alone.
+
+    Parameters
+    ----------
+    events, samples : dict of str to int
+        Events and measured samples of each record, or of each part of a single one.
+
+    """
+
+    events: dict[str, int]
+    samples: dict[str, int]
+
+    @property
+    def run_length(self) -> float:
+        """Samples between events that are certain at 95 %, by the exact bound of Poisson's rate."""
+        return shortest(sum(self.events.values()), sum(self.samples.values()))
+
+    def kept(self, arl: float) -> bool:
+        """Whether the events agree with an average run length."""
+        events, samples = sum(self.events.values()), sum(self.samples.values())
+        return FalseAlarmTest(events, samples, arl).passed
+
+    def text(self, rate: float) -> str:
+        """One sentence, for samples at a rate in Hz."""
+        worst = max(self.events, key=lambda name: self.events[name])
+        count, hours = sum(self.events.values()), sum(self.samples.values()) / rate / 3600
+        text = (
+            f"Of {len(self.events)} parts of the calibration, each left out in turn, {count} "
+            f"events in {hours:.3g} h: at most one in {duration(self.run_length / rate)} (exact "
+            "95 % bound)"
+        )
+        if count:
+            text += f"; {self.events[worst]} of them in {worst}: records of more days would help"
+        return f"{text}."
+
+
+def shortest(events: int, samples: float) -> float:
+    """The lower 95 % bound of the average samples per event, exact by Poisson (Garwood, 1936)."""
+    from scipy.stats import chi2
+
+    return float(samples / (chi2.ppf(0.95, 2 * (events + 1)) / 2))
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,12 @@ MIN_ERRORS = 8
 """Calibration errors per stream, at least."""
 COPIES = 8
 """Places inside a rounding interval that stand for a rounded error."""
+REPEATED = 0.02
+"""Share of samples that repeat the one before from which on a sensor may round."""
+NEAR = 10.0
+"""Steps up to which a difference is counted with a step that is not exact yet."""
+INEXACT = 0.05
+"""Share of a step by which a value may be no multiple of it."""
 FARTHEST = 4.0
 """Scores beyond it count as it in a detector."""
 SCALES = np.geomspace(0.05, 2, 32)
@@ -174,6 +180,9 @@ def middle(low: NDArray, high: NDArray) -> NDArray:
 def resolution(measured: ArrayLike) -> NDArray:
     """The steps to which a sensor rounds, 0 where it does not.
 
+    Samples that were interpolated to a common rate, or written with few decimals, are not exact
+    multiples any more, but those that repeat the one before are, to a twentieth of a step.
+
     Parameters
     ----------
     measured : array (streams, T)
@@ -182,21 +191,33 @@ def resolution(measured: ArrayLike) -> NDArray:
     Returns
     -------
     array (streams,)
-        The smallest difference of two values of a stream, if all values are multiples of it from
-        each other, to a millionth of their range, and less than half of them are different.
+        The largest difference of two values of a stream of which all values are multiples from
+        each other: of all values if less than half of them are different, else of repeated ones.
 
     """
     given = np.asarray(measured, dtype=float)
-    steps = np.zeros(len(given))
-    for i, row in enumerate(given):
-        values, counts = np.unique(row[np.isfinite(row)], return_counts=True)
-        if 1 < len(values) < counts.sum() / 2:
-            offsets = values - values[0]
-            differences = np.diff(values)
-            step = differences[differences > 1e-9 * offsets[-1]].min()
-            if np.all(np.abs(offsets - step * np.round(offsets / step)) <= 1e-6 * offsets[-1]):
-                steps[i] = step
-    return steps
+    return np.array([_step_of(row[np.isfinite(row)]) for row in given])
+
+
+def _step_of(seen: NDArray) -> float:
+    """The step of finite values (n,), 0 for none."""
+    values = np.unique(seen)
+    if len(values) >= len(seen) / 2:
+        repeated = seen[1:][np.diff(seen) == 0]
+        values = np.unique(repeated) if len(repeated) > REPEATED * len(seen) else values[:0]
+    if len(values) < 2:
+        return 0.0
+    offsets, gaps = values - values[0], np.diff(values)
+    for step in np.unique(gaps)[::-1]:
+        # Small gaps first, since the error of a step adds up over many.
+        near = gaps < NEAR * step
+        many = np.round(gaps[near] / step)
+        better = float(many @ gaps[near] / (many @ many))
+        number = np.concatenate([[0], np.cumsum(np.round(gaps / better))])
+        exact = float(number @ offsets / (number @ number))
+        if np.all(np.abs(offsets - exact * number) <= INEXACT * exact):
+            return exact
+    return 0.0
 
 
 def _key(stream: NDArray, value: NDArray) -> NDArray:

@@ -19,7 +19,7 @@ class Received:
     counts : Counts
         Samples by what was done with them; a trajectory counts once.
     alarms : int
-        Alarms that were raised when they were used.
+        Events that began when they were used.
 
     """
 
@@ -43,12 +43,12 @@ class AssetStatus:
     ratio : float
         Evidence for a change, over the threshold of an alarm.
     alarms : int
-        Alarms since the program was started.
+        Events since the program was started.
     last_alarm : int, optional
         Time of the last one of these.
-    void, outside : bool
-        Whether the promise does not apply any more, and whether commands have left their range in
-        calibration.
+    event, void, outside : bool
+        Whether an event lasts, whether the promise does not apply any more, and whether commands
+        have left their range in calibration.
     rate : str
         How the sample rate differs from the twin's; "" if it does not.
     counts : dict of str to int
@@ -63,6 +63,7 @@ class AssetStatus:
     ratio: float
     alarms: int
     last_alarm: int | None
+    event: bool
     void: bool
     outside: bool
     rate: str
@@ -79,6 +80,7 @@ class AssetStatus:
             machine.evidence / arl,
             machine.alarms,
             machine.last_alarm,
+            machine.event,
             machine.void,
             machine.outside,
             machine.rate,

@@ -19,8 +19,10 @@ from retwin.monitor.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.monitor import Monitor
 from retwin.monitor.samples import SECOND, Samples
 from retwin.monitor.updates import EARLIEST, Asset
-from retwin.monitor.watched import Alarm, Watched
+from retwin.monitor.watched import Alarm, Ending, Watched
 
+ALARM = ("sample", "output", "change", "evidence", "machine")
+"""What the log has of an alarm, beside its time and that of its event."""
 DEFAULT_WAIT = 2
 """Sample periods for which a place is waited for, unless it is given."""
 LONGEST_GAP = 10_000
@@ -165,6 +167,7 @@ class StreamMachine(Machine[Monitor]):
         state: NDArray,
         found: Mapping[str, NDArray],
         alarms: Sequence[Alarm],
+        endings: Sequence[Ending],
     ) -> None:
         """Take the state after these samples, and what was found in them."""
         self._state, self.changed = state, True
@@ -172,11 +175,20 @@ class StreamMachine(Machine[Monitor]):
         self.outside = bool(found["outside"])
         places = work.first + np.arange(len(work.values))
         times = work.origin + np.round(places * self._period).astype(np.int64)
+        self.event = bool(found["event"][-1]) and not any(
+            each.sample == places[-1] for each in endings
+        )
         for alarm in alarms:
-            self.alarms += 1
-            self.last_alarm = int(times[alarm.sample - work.first])
-            data = {name: getattr(alarm, name) for name in ("sample", "output", "change")}
-            self._log("alarm", self.last_alarm, **data, evidence=alarm.evidence)
+            moment = int(times[alarm.sample - work.first])
+            if alarm.opens and alarm.promised:
+                self.alarms += 1
+                self.last_alarm = moment
+            data = {name: getattr(alarm, name) for name in ALARM}
+            event = self._moment(work, alarm.event)
+            self._log("alarm" if alarm.promised else "remark", moment, **data, event=event)
+        for ending in endings:
+            moment, event = (self._moment(work, each) for each in (ending.sample, ending.event))
+            self._log("end", moment, event=event, how=ending.how)
         void = found["void"]
         if void.any() and not self.void:
             self._log("void", int(times[int(np.argmax(void))]))
@@ -229,10 +241,15 @@ class StreamMachine(Machine[Monitor]):
             return False  # it begins anew
         self._origin, self._done, self._farthest, self._window = origin, done, done, window
         self._state, self._begins = arrays["monitor"], False
-        self.void = bool(self.layout.state(self._state[None]).void[0])
+        before = self.layout.state(self._state[None])
+        self.void, self.event = bool(before.void[0]), bool(before.course.event[0] >= 0)
         self.evidence, *wrong = arrays["status"].tolist()
         self._wrong = [int(each) for each in wrong]
         return True
+
+    def _moment(self, work: Work, place: int) -> int:
+        """The time of a place of the stream of some work, in nanoseconds."""
+        return work.origin + round(place * self._period)
 
     def _place(self, moment: int) -> int:
         assert self._origin is not None
@@ -345,16 +362,15 @@ def step(together: Sequence[tuple[StreamMachine, Work]]) -> dict[str, int]:
     names = [each.asset.name for each in machines]
     after, watched = monitor.step(before, commands, measured, names)
     states = layout.rows(after)
-    alarms: dict[str, list[Alarm]] = {name: [] for name in names}
-    for alarm in watched.alarms:
-        alarms[alarm.trajectory].append(alarm)
     for i, (machine, work) in enumerate(together):
-        machine.stepped(work, states[i], _row(watched, i), alarms[machine.asset.name])
-    return {name: len(each) for name, each in alarms.items()}
+        alarms = [each for each in watched.alarms if each.trajectory == names[i]]
+        endings = [each for each in watched.endings if each.trajectory == names[i]]
+        machine.stepped(work, states[i], _row(watched, i), alarms, endings)
+    return {name: sum(each.trajectory == name for each in watched.events) for name in names}
 
 
 def _row(watched: Watched, i: int) -> dict[str, NDArray]:
     return {
         name: getattr(watched, name)[i]
-        for name in ("mean", "deviation", "evidence", "void", "outside")
+        for name in ("mean", "deviation", "evidence", "event", "void", "outside")
     }

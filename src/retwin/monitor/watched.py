@@ -25,6 +25,12 @@ class Alarm:
         The change of that output's errors for which there is most evidence.
     evidence : float
         At least the average run length of the promise.
+    event : int
+        Number of the sample of the first alarm of its event; its own, if it opens one.
+    promised : bool
+        Whether the promise applies; else it is no alarm but a remark.
+    machine : tuple of float
+        The parameters of the machine along the directions of the filter, see `OnlineFilter`.
 
     """
 
@@ -34,6 +40,35 @@ class Alarm:
     output: str
     change: str
     evidence: float
+    event: int
+    promised: bool = True
+    machine: tuple[float, ...] = ()
+
+    @property
+    def opens(self) -> bool:
+        """Whether it is the first one of its event."""
+        return self.event == self.sample
+
+
+@dataclass(frozen=True)
+class Ending:
+    """The end of an event.
+
+    Attributes
+    ----------
+    trajectory : str
+        The id of the record or machine.
+    event, sample : int
+        Numbers of the sample of its first alarm, and of the one at which it ends.
+    how : str
+        "the twin follows again", or "changed".
+
+    """
+
+    trajectory: str
+    event: int
+    sample: int
+    how: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +84,15 @@ class Watched:
         do not count.
     evidence : NDArray
         (n, T), that of a change; an alarm is raised from the average run length on.
-    alarm, void : NDArray
-        (n, T) bool, whether an alarm was raised, and whether the promise does not apply.
+    alarm, event, void : NDArray
+        (n, T) bool, whether an alarm was raised, whether an event lasts, and whether the promise
+        does not apply.
     outside : NDArray
         (n,) bool, whether commands leave the range that they had when the twin was calibrated.
     alarms : list of Alarm
-        The alarms.
+        The alarms; those that open an event are `events`.
+    endings : list of Ending
+        The ends of events.
 
     """
 
@@ -63,6 +101,13 @@ class Watched:
     score: NDArray
     evidence: NDArray
     alarm: NDArray
+    event: NDArray
     void: NDArray
     outside: NDArray
     alarms: list[Alarm]
+    endings: list[Ending]
+
+    @property
+    def events(self) -> list[Alarm]:
+        """The first alarm of each event."""
+        return [each for each in self.alarms if each.opens]

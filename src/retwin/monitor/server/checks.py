@@ -46,8 +46,7 @@ SENTENCES: Mapping[type, Callable[[Any, AnyMonitor], str]] = {
 }
 NOTHING = (
     "None of the known faults explains the alarm better than the healthy machine does. Look at the "
-    "samples around it; a single disturbance from outside is possible, and so is a false alarm, "
-    "which is as rare as promised."
+    "samples around it; a single disturbance from outside is possible, and so is a false alarm."
 )
 UNNAMED = (
     "Compare what the machine does on site with what it is commanded and with what its sensors "

@@ -34,6 +34,11 @@ class Journal:
         self._lock = threading.Lock()
         self._last = -1
         self._alarms: dict[int, dict[str, Any]] = {}
+        self._event: dict[str, dict[str, Any]] = {}
+        """The newest event of each asset, as its first alarm."""
+        self._opened: dict[int, int] = {}
+        """The first alarm of the event to which each further one belongs."""
+        self._void: dict[str, float] = {}
         self._events: dict[str, deque[dict[str, Any]]] = {}
 
     def alarms(
@@ -61,6 +66,11 @@ class Journal:
             alarms = self._alarms.values()
             return {each["asset"]: each for each in alarms if each["acknowledged"] is None}
 
+    def void(self, asset: str) -> float | None:
+        """When the promise of an asset became void the last time."""
+        with self._read():
+            return self._void.get(asset)
+
     def events(self, asset: str) -> list[dict[str, Any]]:
         """The newest events of an asset, its alarms among them, the newest first."""
         with self._read():
@@ -78,14 +88,25 @@ class Journal:
             yield
 
     def _add(self, entry: Entry, data: Mapping[str, Any]) -> None:
-        alarm = self._alarms.get(data["alarm"]) if entry.kind in ("cause", "acknowledge") else None
+        of = data.get("alarm", -1)
+        alarm = self._alarms.get(self._opened.get(of, of))
         if alarm is not None and entry.kind == "cause":
-            alarm["cause"] = dict(data)
+            if not data.get("same"):
+                alarm["cause"] = dict(data)
+        elif entry.kind == "end":
+            event = self._event.pop(data["asset"], None)
+            if event is not None:
+                event |= {"ended": data["time"] / SECOND, "how": data["how"]}
         elif alarm is not None:  # it is for the earlier ones of the asset too
             for sequence, each in self._alarms.items():
                 if sequence <= data["alarm"] and each["asset"] == alarm["asset"]:
                     each["acknowledged"] = each["acknowledged"] or dict(data)
-        elif entry.kind in ("alarm", "void", "event"):
+        elif entry.kind == "alarm" and data.get("event", data["time"]) != data["time"]:
+            event = self._event.get(data["asset"])
+            if event is not None:
+                self._opened[entry.sequence] = event["sequence"]
+                event["alarms"] += 1
+        elif entry.kind in ("alarm", "remark", "void", "event"):
             require(
                 {"asset", "time"} <= data.keys(),
                 f"entry {entry.sequence} of the log",
@@ -96,8 +117,12 @@ class Journal:
             made = {**data, "kind": entry.kind, "sequence": entry.sequence}
             made["time"] = data["time"] / SECOND
             if entry.kind == "alarm":
-                made |= {"cause": data.get("cause"), "acknowledged": None}
+                made |= {"cause": data.get("cause"), "acknowledged": None, "alarms": 1}
+                made |= {"ended": None, "how": ""}
+                self._event[data["asset"]] = made
                 if "begin" in data:  # of a trajectory
                     made["begin"] = data["begin"] / SECOND
                 self._alarms[entry.sequence] = made
+            if entry.kind == "void":
+                self._void[data["asset"]] = made["time"]
             self._events.setdefault(data["asset"], deque(maxlen=EVENTS)).append(made)

@@ -48,7 +48,7 @@ class Metrics:
         samples = CounterMetricFamily(
             "retwin_samples", "Samples by what was done with them.", labels=["asset", "result"]
         )
-        alarms = CounterMetricFamily("retwin_alarms", "Alarms since the start.", labels=["asset"])
+        alarms = CounterMetricFamily("retwin_alarms", "Events since the start.", labels=["asset"])
         gauges = {
             name: GaugeMetricFamily(f"retwin_{name}", text, labels=["asset"])
             for name, text in GAUGES.items()
@@ -58,6 +58,7 @@ class Metrics:
                 samples.add_metric([each.asset, result], count)
             alarms.add_metric([each.asset], each.alarms)
             gauges["evidence_ratio"].add_metric([each.asset], each.ratio)
+            gauges["event"].add_metric([each.asset], each.event)
             gauges["void"].add_metric([each.asset], each.void)
             gauges["outside"].add_metric([each.asset], each.outside)
             if each.time is not None:
@@ -72,6 +73,7 @@ class Metrics:
 
 GAUGES = {
     "evidence_ratio": "Evidence for a change divided by the threshold of an alarm.",
+    "event": "Whether an event lasts.",
     "void": "Whether the promise does not apply any more.",
     "outside": "Whether commands leave the range of the calibration.",
     "newest_sample_seconds": "Time of the newest sample since the epoch.",

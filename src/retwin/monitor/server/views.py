@@ -97,6 +97,8 @@ class Views:
         return {
             "status": self._status(status, self.journal.open(), twins),
             "arl": monitor.arl,
+            "run_length": getattr(monitor, "run_length", monitor.arl),
+            "tried": tried(monitor),
             "rate": pace(monitor),
             "kind": "scores" if isinstance(monitor, TrajectoryMonitor) else "samples",
             "promise": {name: str(each) for name, each in monitor.promises.items()},
@@ -185,6 +187,8 @@ class Views:
             "version": status.version,
             "time": None if status.time is None else status.time / SECOND,
             "evidence": status.ratio,
+            "event": status.event,
+            "void_since": self.journal.void(status.asset) if status.void else None,
             "alarm": None if alarm is None else self._explained(alarm, twins),
             "state": next(name for name, holds in states.items() if holds),
             "rate": status.rate,
@@ -209,6 +213,15 @@ class Views:
 
 Named = list[tuple[str, str]]
 """Names and units of channels."""
+
+
+def tried(monitor: AnyMonitor) -> dict[str, Any] | None:
+    """What happened on the records of the calibration that were left out; None for others."""
+    if isinstance(monitor, TrajectoryMonitor):
+        return None
+    found = monitor.tried
+    counts = {name: sum(getattr(found, name).values()) for name in ("events", "samples")}
+    return {**counts, "run_length": found.run_length}
 
 
 def _channels(monitor: AnyMonitor) -> tuple[Named, Named]:

@@ -13,7 +13,7 @@ from retwin.checks import finite, require
 from retwin.data.trajectories import Trajectories
 from retwin.scores.residuals import Correlogram, autocorrelation, ljung_box
 
-__all__ = ["Prediction", "log_density", "root_of", "whitened"]
+__all__ = ["Narrowing", "Prediction", "log_density", "root_of", "whitened"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,24 +100,10 @@ class Prediction:
             (n, T, d_y, r), derivatives of the means.
 
         """
-        mean, covariance, seen = self.mean.copy(), self.covariance.copy(), self.record.mask
-        count, samples, _, width = slopes.shape
-        factor = root_of(covariance, seen)
-        white = np.linalg.solve(factor, np.where(seen[..., None], slopes, 0.0))
-        errors = whitened(self.record.observed - mean, factor, seen)
-        centre, root = np.zeros((count, width)), np.tile(np.eye(width), (count, 1, 1))
-        for t in range(samples):
-            mean[:, t] += (slopes[:, t] @ centre[..., None])[..., 0]
-            h = slopes[:, t] @ root
-            covariance[:, t] += h @ h.swapaxes(1, 2)
-            # Potter's update of a factor of the covariance, which rounding cannot make negative.
-            for own, error in zip(white[:, t].swapaxes(0, 1), errors[:, t].T, strict=True):
-                f = (own[:, None] @ root)[:, 0]
-                variance = 1 + np.sum(f**2, axis=1)
-                gain = (root @ f[..., None])[..., 0] / variance[:, None]
-                centre = centre + gain * (error - np.sum(own * centre, axis=1))[:, None]
-                narrowed = gain / (1 + 1 / np.sqrt(variance))[:, None]
-                root = root - narrowed[..., None] * f[:, None]
+        count, width = len(self.mean), slopes.shape[-1]
+        narrowing = Narrowing(np.zeros((count, width)), np.tile(np.eye(width), (count, 1, 1)))
+        given = self.mean, self.covariance, self.record.observed, self.record.mask
+        mean, covariance = narrowing.run(*given, slopes)
         return replace(self, mean=mean, covariance=covariance)
 
     def log_density(self) -> NDArray:
@@ -129,6 +115,66 @@ class Prediction:
         error = (self.record.observed - self.mean) / self.deviation
         made: NDArray = np.where(self.record.mask, error, np.nan)
         return made
+
+
+@dataclass(eq=False)
+class Narrowing:
+    """Recursive least squares: each sample narrows the distribution of Gaussian parameters.
+
+    Attributes
+    ----------
+    centre, root : NDArray
+        (n, r) and (n, r, r), their mean and a factor of their covariance; both change.
+
+    """
+
+    centre: NDArray
+    root: NDArray
+
+    def run(
+        self,
+        mean: NDArray,
+        covariance: NDArray,
+        measured: NDArray,
+        seen: NDArray,
+        slopes: NDArray,
+        gate: float = np.inf,
+    ) -> tuple[NDArray, NDArray]:
+        """Means and covariances with the uncertainty of the parameters, before each sample.
+
+        Parameters
+        ----------
+        mean, covariance : NDArray
+            (n, T, d_y) and (n, T, d_y, d_y), at the parameters 0.
+        measured, seen : NDArray
+            (n, T, d_y), outputs, and whether each is used.
+        slopes : NDArray
+            (n, T, d_y, r), derivatives of the means.
+        gate : float
+            An error of more standard deviations is no news of the parameters.
+
+        """
+        mean, covariance = mean.copy(), covariance.copy()
+        factor = root_of(covariance, seen)
+        white = np.linalg.solve(factor, np.where(seen[..., None], slopes, 0.0))
+        white = np.where(np.isfinite(white), white, 0.0)
+        errors = whitened(measured - mean, factor, seen)  # NaN, where not finite, is no news
+        for t in range(mean.shape[1]):
+            mean[:, t] += (slopes[:, t] @ self.centre[..., None])[..., 0]
+            h = slopes[:, t] @ self.root
+            covariance[:, t] += h @ h.swapaxes(1, 2)
+            # Potter's update of a factor of the covariance, which rounding cannot make negative.
+            for own, error in zip(white[:, t].swapaxes(0, 1), errors[:, t].T, strict=True):
+                f = (own[:, None] @ self.root)[:, 0]
+                variance = 1 + np.sum(f**2, axis=1)
+                gain = (self.root @ f[..., None])[..., 0] / variance[:, None]
+                news = error - np.sum(own * self.centre, axis=1)
+                used = np.abs(news) <= gate * np.sqrt(variance)
+                gain = np.where(used[:, None], gain, 0.0)
+                self.centre = self.centre + gain * np.where(used, news, 0.0)[:, None]
+                narrowed = gain / (1 + 1 / np.sqrt(variance))[:, None]
+                self.root = self.root - narrowed[..., None] * f[:, None]
+        return mean, covariance
 
 
 def log_density(error: NDArray, covariance: NDArray, seen: NDArray) -> NDArray:

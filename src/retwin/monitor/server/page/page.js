@@ -306,8 +306,10 @@
   };
 
   // One machine.
-  const WORDS = { alarm: (each) => `${each.output}: ${each.change}; ${cause(each)}`, void: () => "the promise does not apply any more: calibrate again",
-    event: (each) => each.text };
+  // An event lasts from its first alarm until the twin follows again.
+  const course = (each) => each.ended ? `, until ${stamp(each.ended)} (${each.how})` : "";
+  const WORDS = { alarm: (each) => `${each.output}: ${each.change}; ${cause(each)}${course(each)}`, void: () => "the promise does not apply any more: recalibrate, or repair the machine",
+    remark: (each) => `Remark, for which nothing is promised: ${each.output}: ${each.change}`, event: (each) => each.text };
   const asset = (name) => {
     const next = stream(name);
     const head = h("div");
@@ -324,8 +326,8 @@
       const now = held.status;
       const last = now.alarm;
       const texts = {
-        alarm: () => [`Alarm at ${stamp(last.time)}; ${last.output}: ${last.change}.`, h("a", { href: to("alarm", last.sequence) }, `Cause: ${cause(last)}`)],
-        void: () => ["The promise does not apply any more: the machine is not the one of the calibration.", "Calibrate the monitor again on healthy records."],
+        alarm: () => [`Event since ${stamp(last.time)}${course(last)}; ${last.output}: ${last.change}.`, ...(now.void_since ? [`The promise is VOID since ${stamp(now.void_since)}.`] : []), h("a", { href: to("alarm", last.sequence) }, `Cause: ${cause(last)}`)],
+        void: () => [`The promise is VOID${now.void_since ? ` since ${stamp(now.void_since)}` : ""}: the machine is not the one of the calibration. What is seen are remarks, not alarms.`, "If the machine is healthy, recalibrate the monitor with its newest quiet hours."],
         stopped: () => [`No new sample has arrived for ${span(now.idle)}.`, "Check the source of the samples and its connection."],
         outside: () => ["Commands leave the range of the calibration, where the twin extrapolates.", "Calibrate on records that have such commands."],
         rate: () => ["Samples arrive at another rate than the twin's.", now.rate],
@@ -335,7 +337,8 @@
         facts(["Evidence for a change", now.evidence ? `${percent(now.evidence)} of the threshold` : "none", `alarm from ${digits(held.arl)} on`],
           ["Newest sample", stamp(now.time), Object.entries(now.counts).filter(([, n]) => n).map(([k, n]) => `${n} ${k}`).join(", ")],
           ["Twin", h("a", { href: to("versions", now.twin) }, now.twin), `version ${now.version}`],
-          ["False alarms", `1 in ${span(held.arl / held.rate)}`, "on average, at most"]));
+          ["False events, promised", `1 in ${span(held.run_length / held.rate)}`, "under the model, on average, at most"],
+          ...(held.tried ? [["False events, tried", `${held.tried.events} in ${span(held.tried.samples / held.rate)}`, `records left out in turn: at most 1 in ${span(held.tried.run_length / held.rate)} (exact 95 % bound)`]] : [])));
       if (draw) draw(held);
       const text = JSON.stringify(held.events);
       if (text !== shown && !log.contains(document.activeElement)) {
@@ -386,7 +389,7 @@
       shown = text;
       const why = found.cause;
       about.replaceChildren(h("h1", {}, found.asset, ": ", why ? fault(why.name) : "cause not known yet"),
-        verdict("alarm", `Alarm at ${stamp(found.time)}; ${found.output}: ${found.change}. The twin of the healthy machine does not explain it.`,
+        verdict("alarm", `Event since ${stamp(found.time)}${course(found)}; ${found.output}: ${found.change}. The twin of the healthy machine does not explain it.`,
           h("a", { href: to("asset", found.asset) }, "See the machine now")),
         facts(found.begin ? ["Trajectory", stamp(found.begin), `to ${clock(found.time)}`] : ["Began", why && why.onset[0] != null ? stamp(why.onset[0]) : "–", why && why.onset[1] != null && `90 % interval ${clock(why.onset[1])} to ${clock(why.onset[2])}`],
           ...(found.begin ? [] : [["Size", ...(why ? interval(why.size, why.unit) : ["–"])]]),

@@ -1,0 +1,100 @@
+"""Each line that decides about an alarm, an event or a promise, at its limit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from retwin.monitor.decision import SIGNIFICANCE, Decision, FalseAlarmTest
+from retwin.monitor.detector import Detector
+from retwin.monitor.events import CERTAIN, Course, Rules
+from retwin.monitor.promise import Tried, shortest
+from retwin.monitor.slack import Slack
+from retwin.monitor.validity import Validity
+
+RULES = Rules(arl=1000.0, wanted=5, lasting=20)
+
+
+def course(event: int = -1, quiet: int = 0, samples: int = 100) -> Course:
+    return Course(*(np.array([each]) for each in (samples, 0, event, quiet)))
+
+
+def test_an_alarm_is_raised_at_the_run_length_and_not_below() -> None:
+    assert RULES.alarms(np.array([999.9, 1000.0, 1000.1])).tolist() == [False, True, True]
+
+
+def test_an_event_needs_as_many_samples_as_show_a_shift_of_one_deviation() -> None:
+    rules = Rules.of(1e6, 100)
+    assert rules.wanted == 28  # 2 log(1e6) = 27.6
+    for steps in (4, 5, 6):
+        counted = np.ones((1, steps), dtype=bool)
+        ends = RULES.ends(course(event=90), np.zeros((1, steps)), counted)[0]
+        assert ends.tolist() == [place >= 4 for place in range(steps)]
+    counted = np.array([[True, False, True]])
+    assert RULES.ends(course(event=90, quiet=3), np.zeros((1, 3)), counted)[0].tolist() == [
+        False,
+        False,
+        True,
+    ]
+    assert not RULES.ends(course(), np.zeros((1, 9)), np.ones((1, 9), dtype=bool)).any()
+
+
+def test_an_event_does_not_end_while_there_is_evidence() -> None:
+    counted = np.ones((1, 1), dtype=bool)
+    for evidence, ended in ((5 / CERTAIN - 1, True), (5 / CERTAIN, False)):
+        found = RULES.ends(course(event=90, quiet=4), np.array([[evidence]]), counted)
+        assert found.tolist() == [[ended]]
+
+
+def test_an_event_is_a_change_after_the_stated_time() -> None:
+    assert RULES.changes(course(event=90), 12)[0].tolist() == [False] * 10 + [True] * 2
+    assert not RULES.changes(course(), 50).any()
+
+
+def test_an_alarm_opens_an_event_and_a_further_one_belongs_to_it() -> None:
+    yes, no, counted = np.array([True]), np.array([False]), np.ones((1, 3), dtype=bool)
+    opened = RULES.after(course(quiet=7), counted, yes, no, no)
+    assert (opened.event[0], opened.begun[0], opened.quiet[0]) == (102, 103, 0)
+    assert opened.samples[0] == 103
+    further = RULES.after(opened, counted, yes, no, no)
+    assert (further.event[0], further.begun[0], further.quiet[0]) == (102, 106, 0)
+    calm = RULES.after(opened, counted, no, no, no)
+    assert (calm.event[0], calm.begun[0], calm.quiet[0]) == (102, 103, 3)
+    ended = RULES.after(calm, counted, no, yes, no)
+    assert (ended.event[0], ended.begun[0], ended.quiet[0]) == (-1, 103, 0)
+    changed = RULES.after(calm, counted, no, no, yes)
+    assert (changed.event[0], changed.begun[0], changed.quiet[0]) == (-1, 109, 0)
+
+
+def test_a_promise_is_void_at_its_evidence_and_not_below() -> None:
+    validity = Validity(Detector(Slack()), 1000.0, alpha=0.01)
+    state = validity.start(3)
+    highest = np.array([99.9, 100.0, 100.1])
+    assert validity.void(type(state)(**{**vars(state), "highest": highest})).tolist() == [
+        False,
+        True,
+        True,
+    ]
+
+
+def test_the_rate_of_records_left_out_has_the_exact_bound() -> None:
+    assert shortest(0, 3.0) == pytest.approx(3.0 / 2.9957, rel=1e-4)
+    assert shortest(2, 3.0) == pytest.approx(3.0 / 6.2958, rel=1e-4)
+    none = Tried({"a": 0, "b": 0}, {"a": 600, "b": 600})
+    assert none.kept(1e9)
+    assert "0 events in 0.333 h" in none.text(1.0)
+    one = Tried({"a": 0, "b": 1}, {"a": 600, "b": 600})
+    assert one.kept(1200 / 0.06)  # one or more of 0.06 expected: 5.8 %
+    assert not one.kept(1200 / 0.05)  # 4.9 %
+    assert one.run_length == pytest.approx(1200 / 4.7439, rel=1e-4)
+    assert "1 of them in b" in one.text(1.0)
+
+
+def test_a_version_is_better_above_zero_and_with_alarms_as_promised() -> None:
+    passed = FalseAlarmTest(0, 100, 1000.0)
+    limit = Decision(1.0, 1.0, 0.0, 0.0, 0.1, passed)
+    assert not limit.better
+    assert Decision(1.0, 1.0, 0.0, 1e-9, 0.1, passed).better
+    broken = FalseAlarmTest(3, 100, 1000.0)
+    assert broken.p < SIGNIFICANCE
+    assert not Decision(1.0, 0.5, 0.5, 0.4, 0.6, broken).better
