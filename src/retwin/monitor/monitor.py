@@ -158,9 +158,10 @@ class Monitor:
         require(
             commands.shape == (count, samples, len(self.twin.inputs))
             and measured.shape == (count, samples, len(self.twin.outputs))
-            and count == len(state.void),
+            and count == len(state.void)
+            and samples > 0,
             "measured",
-            expected=f"samples of {len(state.void)} machines with {len(self.twin.inputs)} "
+            expected=f"one or more samples of {len(state.void)} machines with {len(self.twin.inputs)} "
             f"commands and {len(self.twin.outputs)} outputs",
             got=f"shapes {commands.shape} and {measured.shape}",
             remedy="give arrays (machines, samples, channels)",
