@@ -15,7 +15,7 @@ from retwin.checks import given, require
 from retwin.checks import one_of as in_catalog
 from retwin.cli.completion import one_of
 from retwin.cli.options import CaseArgument, Horizon, Json, LogMapping, MaxBytes, Seed, seconds_of
-from retwin.cli.reading import read, shown_records
+from retwin.cli.reading import read, read_all, shown_records
 from retwin.cli.terminal import Interrupted, answer, bar, note, table
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.places import check_place
@@ -38,7 +38,9 @@ def _named(text: str, names: Iterable[str]) -> Any:
 ModelFolder = Annotated[
     Path, typer.Option(metavar="FOLDER", help="Where to save the updated twin.")
 ]
-RealSet = Annotated[Path | None, data_option(help="Real trajectories to calibrate on.")]
+RealSet = Annotated[
+    list[Path] | None, data_option(help="Real trajectories to calibrate on; may be repeated.")
+]
 OneFile = Annotated[Path | None, data_option(help="Or one file that the case splits in two.")]
 TwinSet = Annotated[Path | None, data_option(help="Trajectories of the twin; else simulated.")]
 Simulations = Annotated[
@@ -266,21 +268,21 @@ def _system(
 
 def _measured(
     system: Case,
-    real: Path | None,
+    real: list[Path] | None,
     data: Path | None,
     max_bytes: int | None,
     mapping: Path | None,
 ) -> Trajectories:
     """The real trajectories to calibrate on."""
     require(
-        (real is None) != (data is None),
+        bool(real) != (data is not None),
         "real data",
         expected="either --real or --data",
-        got="none" if real is None else "both",
+        got="both" if real else "none",
         remedy="give --real FILE; or --data FILE, for a case that defines how it is split",
     )
-    if real is not None:
-        return read(real, system, max_bytes=max_bytes, mapping=mapping)
+    if real:
+        return read_all(real, system, max_bytes=max_bytes, mapping=mapping)
     assert data is not None
     expected, got = "a case that defines how its file is split", f"{system.name!r}, which does not"
     return given("--data", system.records, expected, got=got, remedy="give --real FILE")(data)[0]

@@ -24,7 +24,7 @@ from retwin.cli.options import (
     seconds_of,
 )
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import read, read_commands, system_of, updated_twin
+from retwin.cli.reading import read_all, read_commands, system_of, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import Trajectories
@@ -121,7 +121,7 @@ def write_predictions(found: ScoredPrediction, records: Trajectories, out: Path)
 
 def evaluate(
     model: Model,
-    real: Annotated[Path, option("FILE", "Records it was not fitted to.")],
+    real: Annotated[list[Path], option("FILE", "Records it was not fitted to; may be repeated.")],
     horizon: Horizon = "free",
     warm_up: Annotated[str, option("TIME", "Begin of each record that is not scored, as 5s.")] = "",
     out: Annotated[Path | None, option("FILE", "CSV file of predictions with bands.")] = None,
@@ -140,7 +140,7 @@ def evaluate(
         check_place(out)
     updated = updated_twin(model)
     system = system_of(updated, model, case)
-    records = read(real, system, max_bytes=max_bytes, mapping=mapping)
+    records = read_all(real, system, max_bytes=max_bytes, mapping=mapping)
     scores = score_model(
         updated, records, horizon=ahead, warm_up=skipped, twin=system.twin, seed=seed
     )

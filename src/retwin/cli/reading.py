@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,6 +90,18 @@ def read(
             max_bytes=max_bytes,
             mapping=mapping,
         )
+
+
+def read_all(
+    files: Sequence[Path],
+    case: DataCase | None = None,
+    *,
+    max_bytes: int | None = None,
+    mapping: Path | None = None,
+) -> Trajectories:
+    """The trajectories of all files together."""
+    sets = [read(file, case, max_bytes=max_bytes, mapping=mapping) for file in files]
+    return sets[0] if len(sets) == 1 else Trajectories.concatenate(sets)
 
 
 def read_commands(file: Path, case: Case, *, mapping: Path | None = None) -> Trajectories:

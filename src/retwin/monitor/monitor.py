@@ -161,8 +161,8 @@ class Monitor:
             and count == len(state.void)
             and samples > 0,
             "measured",
-            expected=f"one or more samples of {len(state.void)} machines with {len(self.twin.inputs)} "
-            f"commands and {len(self.twin.outputs)} outputs",
+            expected=f"one or more samples of {len(state.void)} machines with "
+            f"{len(self.twin.inputs)} commands and {len(self.twin.outputs)} outputs",
             got=f"shapes {commands.shape} and {measured.shape}",
             remedy="give arrays (machines, samples, channels)",
         )
