@@ -31,7 +31,8 @@ def comparison_table(found: Fitted) -> Table:
             if not each.rmse:
                 rows.append([Cell(each.title, each.reason), *["–"] * (len(units) + 4)])
                 continue
-            error = f"± {significant(each.standard_error)}" if isfinite(each.standard_error) else ""
+            size = each.standard_error
+            error = f"± {significant(size, size or each.crps)}" if isfinite(size) else ""
             rows.append(
                 [
                     Cell(each.title, "taken" if best else "", best=best),
@@ -40,7 +41,7 @@ def comparison_table(found: Fitted) -> Table:
                         for n, unit in units.items()
                     ),
                     Cell(significant(each.crps), best=best),
-                    Cell(significant(each.difference), error),
+                    Cell(significant(each.difference, size or each.crps), error),
                     f"{each.coverage:.0%}",
                     duration(each.seconds),
                 ]
