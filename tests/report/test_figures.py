@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import plotly.graph_objects as go
 import pytest
 from numpy.typing import NDArray
 
+from retwin.data.quality.finding import Finding
 from retwin.report.figure import Axis, Band, Figure, Line, Matrices, Matrix, Panel, Row
 from retwin.report.plotly_specs import panel_spec
 from retwin.report.png import draw, png
@@ -88,7 +90,8 @@ def test_figures_are_valid_for_both_renderers(study: Content) -> None:
         return "#123456" if isinstance(value, str) and value.startswith("@") else value
 
     sections = sections_of(study_of(study))
-    assert len(sections) == len(SECTIONS) - 3, "all but those of a case without classes"
+    own = len(SECTIONS) - 4
+    assert len(sections) == own, "all but findings of records, and those of a case without classes"
     shown = [figure for section in sections for figure in section.figures]
     assert [figure.name for figure in shown] == [
         "scores",
@@ -147,3 +150,24 @@ def test_gaps_neither_join_a_band_nor_empty_the_envelope_of_a_line() -> None:
     slow = [Line(np.arange(40_000.0), y, "measured", "ink")]
     (line,) = panel_spec(Panel(Axis("time"), [Row(Axis("output"), slow)], "slow"))["data"]
     assert set(line["y"]) == {1.0}
+
+
+def test_records_with_findings_are_a_section_with_their_picture(study: Content) -> None:
+    results, arrays = study
+    names = results["outputs"]["names"]
+    finding = Finding("r1", names[0], "frozen", "stays at exactly 1", 0.1, 0.3)
+    about = {"findings": [asdict(finding)], "explained": {"healthy": {names[0]: 0.9}}}
+    shape, inputs = (1, 50, len(names)), len(results["inputs"]["names"])
+    added = {
+        "records/commands": np.zeros((1, 50, inputs)),
+        "records/nominal": np.zeros(shape),
+        "records/observed": np.ones(shape),
+        "records/mask": np.ones(shape, dtype=bool),
+        "records/ids": np.array(["r1"]),
+        "records/rate": np.array(100.0),
+    }
+    sections = sections_of(study_of((results | {"records": about}, arrays | added)))
+    (section,) = [each for each in sections if each.key == "records"]
+    assert [each.name for each in section.figures] == ["records"]
+    row = section.values["part"].table.rows[0]
+    assert "stays at exactly 1" in str(row)

@@ -81,7 +81,7 @@ def test_page_is_self_contained_and_figures_are_beside_it(study: Study, write: W
     assert "default-src 'none'" in text
     made = {path.stem: path.read_bytes() for path in (folder / "figures").glob("*.png")}
     simulated = {"simulation", "autocorrelation", "crosscorrelation", "spectra", "amplitude"}
-    assert set(made) == set(FIGURES) - simulated - {"overtime", "delta", "z"}
+    assert set(made) == set(FIGURES) - simulated - {"overtime", "delta", "z", "records"}
     assert all(each.startswith(PNG) for each in made.values())
 
 
