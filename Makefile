@@ -50,7 +50,7 @@ docs: install
 bench: install
 	$(BIN)/retwin bench
 	for name in generation training fitting command_space bands inversion updating residual \
-		importing twins fmu state_twin scale bundle; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+		importing twins fmu state_twin scale bundle parameter_coverage; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 	if [ -n "$$RETWIN_DATA" ]; then OMP_NUM_THREADS=1 $(BIN)/python benchmarks/systems.py; fi
 
 # Wheel and source distribution in dist/. The wheel, with its mandatory dependencies alone, runs the
