@@ -161,6 +161,15 @@ def test_models_without_the_twin_are_compared_on_the_same_parts(tmp_path: Path) 
     assert not any("lacks something" in each for each in with_yardstick(known).remarks)
 
 
+def test_copies_of_a_record_count_once() -> None:
+    one = records(0, slope=right, steps=300)
+    six = rt.Trajectories.concatenate([one.replace(ids=[str(i)]) for i in range(6)])
+    alone, copied = (rt.fit(twin_of(), each, rt.Choice(candidates=FAST[:2])) for each in (one, six))
+    assert (len(copied.records), copied.parts) == (1, alone.parts)
+    assert copied.parameters == alone.parameters
+    assert [each.kind for each in copied.checked.findings] == ["copy"] * 5
+
+
 def test_a_wrong_sign_is_mentioned() -> None:
     found = rt.fit(twin_of(sign=-1.0), records(0, slope=right), rt.Choice(candidates=("none",)))
     assert [each.kind for each in found.checked.findings] == ["sign"]

@@ -16,6 +16,7 @@ from retwin.catalog import CANDIDATES
 from retwin.checks import require
 from retwin.data.measured import check_magnitude
 from retwin.data.quality.check import Checked
+from retwin.data.quality.copies import find_copies
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.choice.candidates import Candidates, Model
 from retwin.evaluation.choice.comparison import Comparison
@@ -210,11 +211,15 @@ def _fit_alone(
 
 
 def _select_records(records: Trajectories, settings: Choice) -> Trajectories:
-    """The records to calibrate on; unlabelled ones are healthy where none has a label."""
+    """The records to calibrate on, copies once; unlabelled ones are healthy where all are."""
     check_magnitude("calibration", records, ideal=True)
     if not records.known_labels and settings.calibrate_on == "healthy":
-        return records.replace(labels=[HEALTHY] * len(records))
-    return records[calibrating(records, settings.calibrate_on)]
+        own = records.replace(labels=[HEALTHY] * len(records))
+    else:
+        own = records[calibrating(records, settings.calibrate_on)]
+    # A part that is left out must not be seen in a copy of it.
+    copies = [i for i, _, _ in find_copies(np.where(own.mask, own.observed, np.nan))]
+    return own[np.setdiff1d(np.arange(len(own)), copies)]
 
 
 def _names(candidates: Candidates, settings: Choice) -> list[str]:
