@@ -182,3 +182,10 @@ def test_an_object_of_another_class_is_refused() -> None:
     assert instance("n", 3, int, remedy="count") == 3
     with pytest.raises(InputError, match=r"^n: expected int, got NoneType; count$"):
         instance("n", None, int, remedy="count")
+
+
+def test_a_message_is_short_whatever_came() -> None:
+    error = InputError("log", expected="a column", got="h" * 100_000, remedy="name it")
+    assert len(str(error)) < 3000
+    assert str(error).endswith("…; name it")
+    assert error.got == "h" * 100_000

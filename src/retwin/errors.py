@@ -6,6 +6,9 @@ import sysconfig
 import traceback
 from pathlib import Path
 
+LONGEST = 2000
+"""Characters of each part of a message, at most."""
+
 
 class InputError(ValueError):
     """Bad input: the argument, what was expected, what came, and the remedy, in one line.
@@ -24,7 +27,10 @@ class InputError(ValueError):
     """
 
     def __init__(self, argument: str, *, expected: str, got: str, remedy: str) -> None:
-        super().__init__(f"{argument}: expected {expected}, got {got}; {remedy}")
+        parts = [str(each) for each in (argument, expected, got, remedy)]
+        # What came may be a header of a hundred thousand characters.
+        parts = [each if len(each) <= LONGEST else f"{each[: LONGEST - 1]}…" for each in parts]
+        super().__init__("{}: expected {}, got {}; {}".format(*parts))
         self.argument = argument
         self.expected = expected
         self.got = got
