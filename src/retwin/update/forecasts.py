@@ -203,7 +203,7 @@ def calibrate_forecasts(
     memory = float(FORGOTTEN * correlation[-1].max() / records.rate)
     beyond = max([BEYOND, *(each.excess for each in found if not each.edge)])
     for each in found:
-        if each.edge and _hold(_errors(each, len(leads))[0], deviation[-1]):
+        if each.edge and _hold(each, deviation[-1]):
             beyond = max(beyond, each.excess)
     times = np.append(np.array(leads) / records.rate, np.inf)
     low, high = value_range(values_of(records))
@@ -222,16 +222,16 @@ def _errors(part: LeftOut, i: int) -> tuple[NDArray, NDArray]:
     return np.where(seen, part.record.observed - mean, np.nan), np.where(seen, last, 0.0)
 
 
-def _hold(errors: NDArray, deviation: NDArray) -> bool:
-    """Whether 90 % bands hold so many errors (r, T, d_y) of each output, within chance."""
-    for error, size in zip(np.moveaxis(errors, 2, 0), deviation, strict=True):
-        seen = np.isfinite(error)
-        inside = np.abs(error) <= USUAL * size
-        around = np.where(seen, inside - inside[seen].mean(), 0.0)
-        number = seen.sum() / correlation_time(around[..., None])
-        chance = USUAL * np.sqrt(LEVEL * (1 - LEVEL) / number)
-        if inside[seen].mean() < LEVEL - chance:
-            return False
+def _hold(part: LeftOut, deviation: NDArray) -> bool:
+    """Whether 90 % bands of free simulation hold so much of each output, within chance."""
+    seen = part.record.mask & part.held[..., None]
+    inside = np.abs(part.record.observed - part.free) <= USUAL * deviation  # False for a divergence
+    for own, hits in zip(np.moveaxis(seen, 2, 0), np.moveaxis(inside, 2, 0), strict=True):
+        if own.any():
+            share = hits[own].mean()
+            number = own.sum() / correlation_time(np.where(own, hits - share, 0.0)[..., None])
+            if share < LEVEL - USUAL * np.sqrt(LEVEL * (1 - LEVEL) / number):
+                return False
     return True
 
 
