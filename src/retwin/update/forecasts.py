@@ -206,7 +206,14 @@ def calibrate_forecasts(
         if each.edge and _hold(each, deviation[-1]):
             beyond = max(beyond, each.excess)
     times = np.append(np.array(leads) / records.rate, np.inf)
-    low, high = value_range(values_of(records))
+    known = [values_of(records)]
+    # Errors are calibrated where outputs were predicted, and not only where they were measured.
+    for each in (part for part in found if not part.edge):
+        predicted = each.record.observed - _errors(each, len(leads))[0]
+        unknown = np.full(each.record.commands.shape, np.nan)
+        known.append(np.concatenate([unknown, predicted], axis=2))
+    width = known[0].shape[2]
+    low, high = value_range(np.concatenate([each.reshape(1, -1, width) for each in known], axis=1))
     return ForecastErrors(times, persistence, deviation, independent, memory, low, high, beyond)
 
 
