@@ -1,9 +1,9 @@
 """How many kinds of data that lie are named by `check_records`, and how often clean data are.
 
 Three systems: the emulated arm, the tanks that overflow with the twin that does not, and a heated
-room with two outputs whose twin lacks a loss to the floor. Each kind of lie is told in sets of nine
-records, of which one, three or all lie; it counts as named where a finding has the right record
-and, where the lie is in one channel, the right channel.
+room with two outputs whose twin lacks a loss to the floor. Each kind of fault is put into sets of
+nine records, into one, three or all of them; it counts as named where a finding has the right
+record and, where one channel has it, the right channel.
 
     python benchmarks/lying_data.py --repeats 5 --clean 30
 """
@@ -28,7 +28,7 @@ from retwin.update.agreement import check_with_twin
 
 RECORDS, THINNED = 9, 4
 EVERY = "every"
-"""Of a lie that is told in all records: a finding must be about all, or about each."""
+"""Of a fault that all records have: a finding must be about all, or about each."""
 
 Arrays = dict[str, NDArray]
 Lie = Callable[[Arrays, int, int, np.random.Generator], None]
@@ -373,8 +373,8 @@ def lies(repeats: int) -> Iterator[tuple[str, dict[str, float]]]:
                 continue
             shares = []
             for seed, (twin, records) in enumerate(sets):
-                told, expected = tell(kind, records, np.random.default_rng(seed))
-                found = check_with_twin(None if "command 1000" in kind.name else twin, told)
+                changed, expected = tell(kind, records, np.random.default_rng(seed))
+                found = check_with_twin(None if "command 1000" in kind.name else twin, changed)
                 shares.append(named(found.findings, expected))
             row[name] = float(np.mean(shares))
         yield kind.name, row

@@ -258,7 +258,7 @@ class Hierarchy:
                 means.append(found.origin + found.moved @ found.beta)
                 spread = found.moved @ found.uncertain @ found.moved.mT
                 covariances.append(found.covariance + spread)
-            given = given._drawn(design, drawn, rng)
+            given = given._draw_variances(design, drawn, rng)
         mean = torch.stack(means).mean(dim=0)
         away = torch.stack(means, dim=1) - mean[:, None]
         return mean, torch.stack(covariances).mean(dim=0) + away.mT @ away / DRAWS
@@ -295,14 +295,14 @@ class Hierarchy:
         known = (weighted * features).sum(dim=(0, 1))  # of each coefficient, were x measured
         information = information + torch.diag(ROUNDING * known)
         # As the product of the covariance and the slope at x = 0, without its large numbers.
-        pull = slope - precision * x
-        step = (covariance @ pull[..., None])[..., 0]
+        gradient = slope - precision * x
+        step = (covariance @ gradient[..., None])[..., 0]
         origin = x + step
         uncertain = inverse(information[None])[0]
         right = (weighted * origin[..., None]).sum(dim=(0, 1)) + centre / own
         beta = uncertain @ right
         evidence = 0.5 * (
-            (pull * step).sum()
+            (gradient * step).sum()
             - (precision * x.square()).sum()
             + right @ beta
             - 2 * factor.diagonal(dim1=1, dim2=2).log().sum()
@@ -323,10 +323,12 @@ class Hierarchy:
         both = own * effect * self.total()[design.group]  # conditional variance of either part
         beta = found.beta.square() + found.uncertain.diagonal()
         sums = own.square() * second + both, effect.square() * second + both
-        made = self._maximised(design, *sums, beta, None)
+        made = self._update_variances(design, *sums, beta, None)
         return replace(made, coefficients=found.beta, covariance=found.uncertain)
 
-    def _drawn(self, design: Design, found: _Posterior, rng: np.random.Generator) -> Hierarchy:
+    def _draw_variances(
+        self, design: Design, found: _Posterior, rng: np.random.Generator
+    ) -> Hierarchy:
         """Variances from their distribution for a β and an x that are drawn."""
 
         def normal(like: Tensor) -> Tensor:
@@ -341,7 +343,9 @@ class Hierarchy:
         own, effect = self._parts(design)
         both = own * effect * self.total()[design.group]
         part = effect * error + both.sqrt() * normal(error)
-        return self._maximised(design, (error - part).square(), part.square(), beta.square(), rng)
+        return self._update_variances(
+            design, (error - part).square(), part.square(), beta.square(), rng
+        )
 
     def _parts(self, design: Design) -> tuple[Tensor, Tensor]:
         """Shares (R, P) of a variable's variance that are the error's and the condition's."""
@@ -349,7 +353,7 @@ class Hierarchy:
         effect = self.common[design.group] * design.single
         return own / (own + effect), effect / (own + effect)
 
-    def _maximised(
+    def _update_variances(
         self,
         design: Design,
         error: Tensor,
@@ -361,11 +365,13 @@ class Hierarchy:
         zero = torch.zeros_like(self.variance)
         used, single = design.used, design.used * design.single
 
-        def grouped(values: Tensor) -> Tensor:
+        def sum_by_group(values: Tensor) -> Tensor:
             return zero.index_add(0, design.group, values.sum(dim=0))
 
-        variance = self._variance(design, grouped(error * used), grouped(used), self.variance, rng)
-        total, count = grouped(effect * single), grouped(single)
+        variance = self._variance(
+            design, sum_by_group(error * used), sum_by_group(used), self.variance, rng
+        )
+        total, count = sum_by_group(effect * single), sum_by_group(single)
         shown = ((design.features * used[..., None]).abs().sum(dim=(0, 1)) > 0).to(beta)
         shown = shown * (design.kind == CONDITION)
         total = total.index_add(0, design.owner, beta * shown)

@@ -250,7 +250,9 @@ class Monitor:
             finite_state(online, filtered)
             for online, (filtered, _, _) in zip(self._filters, predicted, strict=True)
         )
-        finite_ = np.all([np.isfinite(each).all(axis=(1, 2)) for _, each, _ in predicted], axis=0)
+        stays_finite = np.all(
+            [np.isfinite(each).all(axis=(1, 2)) for _, each, _ in predicted], axis=0
+        )
         after = replace(
             state,
             filters=filters,
@@ -258,7 +260,7 @@ class Monitor:
             detector=detector,
             changes=changes,
             scale=sums,
-            void=state.void | ~finite_,
+            void=state.void | ~stays_finite,
         )
         deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
         flags = alarm, ended, changed, counted, outside
