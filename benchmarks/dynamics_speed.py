@@ -32,7 +32,7 @@ from retwin.twins import (
     draw_faults,
     faulty_commands,
 )
-from retwin.twins.system_faults import measured_with
+from retwin.twins.faults.system_faults import measured_with
 from retwin.update import fit_dynamics
 
 SEEDS, KNOWN, EACH = (0, 1), 6, 4

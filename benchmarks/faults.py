@@ -32,7 +32,7 @@ from retwin.twins import (
     draw_faults,
     faulty_commands,
 )
-from retwin.twins.system_faults import measured_with
+from retwin.twins.faults.system_faults import measured_with
 from retwin.update import fit_dynamics
 
 KNOWN, EACH, SEEDS = 6, 5, (0, 1, 2)

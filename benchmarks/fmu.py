@@ -18,7 +18,7 @@ import numpy as np
 from fmpy.simulation import instantiate_fmu
 from record import record
 
-from retwin.twins.fmu import FMUTwin
+from retwin.twins.fmu.twin import FMUTwin
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 STEPS = 1000

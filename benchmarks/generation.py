@@ -20,7 +20,7 @@ import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC, ArmPiTwin
 from retwin.cases.case import Case
 from retwin.cli.bench import median_seconds
-from retwin.twins.fmu import FMUTwin
+from retwin.twins.fmu.twin import FMUTwin
 from retwin.twins.twin import Twin
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))

@@ -24,8 +24,8 @@ import retwin as rt
 from retwin.cases.armpi_fpv.twin import UNIT
 from retwin.diagnosis import Diagnosis, Estimate, InversionDiagnoser, fit_inversion
 from retwin.scores.classification import score
-from retwin.twins.applied_faults import draw_faults
-from retwin.twins.faults import ActuatorBias, Stuck
+from retwin.twins.faults.actuator_faults import ActuatorBias, Stuck
+from retwin.twins.faults.applied_faults import draw_faults
 
 HEALTHY = 6
 PER_CLASS = 6

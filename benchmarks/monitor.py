@@ -49,7 +49,7 @@ from retwin.monitor import (
     fit_scores,
     resolution,
 )
-from retwin.monitor.predictors import agreeing
+from retwin.monitor.detect.predictors import agreeing
 
 STREAMS = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
 CALIBRATION, ARL, CENSORED = 500, 1000.0, 20_000

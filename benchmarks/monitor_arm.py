@@ -33,7 +33,7 @@ import retwin as rt
 from retwin.diagnosis import fit_inversion
 from retwin.monitor import TrajectoryMonitor, TrajectoryState, fit_trajectory_monitor
 from retwin.serialisation.files import write_atomically
-from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
 
 FITTED, CALIBRATED, HEALTHY = 12, 54, 300
 MACHINES, TRAJECTORIES = 10, 10

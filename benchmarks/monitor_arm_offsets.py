@@ -15,8 +15,8 @@ from record import record
 
 import retwin as rt
 from retwin.diagnosis import fit_inversion
-from retwin.monitor.offsets import OffsetModel, biases, fit_offsets
-from retwin.twins.faults import ActuatorBias, Fault
+from retwin.monitor.detect.offsets import OffsetModel, biases, fit_offsets
+from retwin.twins.faults.actuator_faults import ActuatorBias, Fault
 
 ARL, SHARE, ORDERS = 1000.0, 1 / 3, 20
 

@@ -45,7 +45,7 @@ from retwin.twins import (
     SensorDrift,
     Stuck,
 )
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.update import DynamicsTwin, OutsideTrainingWarning, fit_dynamics
 
 FALSE_ALARMS = "1 per month"

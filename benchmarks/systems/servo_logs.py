@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC, RATE, UNIT
-from retwin.twins.command_side import CommandSide, command_side_parameters
+from retwin.twins.wrappers.command_side import CommandSide, command_side_parameters
 from systems.arm import Kinematics
 from systems.system import System
 

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 from retwin.data.logs.mapping import Mapping
-from retwin.monitor.registry import Step
 from retwin.monitor.settings import MonitorSettings
+from retwin.monitor.versions.registry import Step
 
 DOCS = Path(__file__).parents[1]
 SCHEMAS = {

@@ -79,12 +79,12 @@ _HOME = homes(
         "report": "write_report",
         "study": "StudyData StudyPlan run_study",
         "twins.collected": "SimulationError",
-        "twins.faults": "ActuatorBias Fault Stuck",
-        "twins.fmu": "FMUTwin",
+        "twins.faults.actuator_faults": "ActuatorBias Fault Stuck",
+        "twins.fmu.twin": "FMUTwin",
         "twins.function": "FunctionTwin",
         "twins.limits": "Limits",
-        "twins.mujoco": "MuJoCoTwin",
-        "twins.parametric": "Parameter ParametricTwin",
+        "twins.mujoco.twin": "MuJoCoTwin",
+        "twins.wrappers.parametric": "Parameter ParametricTwin",
         "twins.twin": "Twin",
         "update.corrected": "CorrectedTwin generate",
         "update.corrections": "Additive Chain CommandSpace Context Correction DelayOffset "
@@ -152,13 +152,13 @@ if TYPE_CHECKING:
     from retwin.report import write_report
     from retwin.study import StudyData, StudyPlan, run_study
     from retwin.twins.collected import SimulationError
-    from retwin.twins.faults import ActuatorBias, Fault, Stuck
-    from retwin.twins.fmu import FMUTwin
+    from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
+    from retwin.twins.fmu.twin import FMUTwin
     from retwin.twins.function import FunctionTwin
     from retwin.twins.limits import Limits
-    from retwin.twins.mujoco import MuJoCoTwin
-    from retwin.twins.parametric import Parameter, ParametricTwin
+    from retwin.twins.mujoco.twin import MuJoCoTwin
     from retwin.twins.twin import Twin
+    from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
     from retwin.update.corrected import CorrectedTwin, generate
     from retwin.update.corrections import (
         Additive,

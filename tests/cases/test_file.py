@@ -19,8 +19,13 @@ from fmus import python_fmu
 import retwin as rt
 from retwin.cases import ColumnRecords
 from retwin.testing import check_twin
-from retwin.twins.samplers import HoldSampler, MultisineSampler, RampSampler, RecordedSampler
-from retwin.twins.system_faults import SensorFreeze
+from retwin.twins.commands.samplers import (
+    HoldSampler,
+    MultisineSampler,
+    RampSampler,
+    RecordedSampler,
+)
+from retwin.twins.faults.system_faults import SensorFreeze
 from retwin.update.identification import LeastSquares, identify
 from retwin.update.residual import SequenceMixture
 

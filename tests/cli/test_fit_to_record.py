@@ -10,7 +10,7 @@ import pytest
 
 import retwin as rt
 from retwin.twins import MultisineSampler, RampSampler, sampler_from
-from retwin.twins.command_range import CommandRange
+from retwin.twins.commands.range import CommandRange
 
 RATE, RESONANCE = 610.0, 68.0
 MODULE = """

@@ -11,7 +11,7 @@ import pytest
 import retwin as rt
 from retwin.cli.monitor import _written
 from retwin.monitor import Alarm
-from retwin.monitor.cause import Cause
+from retwin.monitor.models.cause import Cause
 from retwin.twins import ParameterShift
 from retwin.update import DynamicsTwin
 

@@ -23,7 +23,7 @@ from retwin.deploy.fmu.export import export_fmu
 from retwin.deploy.fmu.segments import DRAWS, ENSEMBLE
 from retwin.errors import InputError
 from retwin.nets.mixtures import BernoulliHead, Blocks
-from retwin.twins.command_range import CommandRange
+from retwin.twins.commands.range import CommandRange
 from retwin.update.corrections import Chain, SampledSensor
 from retwin.update.residual import SequenceMixture, SequenceResidual
 from retwin.update.residual.model import ResidualModel

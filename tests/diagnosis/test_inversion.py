@@ -27,9 +27,9 @@ from retwin.inference.priors import GaussianPrior
 from retwin.nets.training import Training
 from retwin.scores.classification import score
 from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
-from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from
-from retwin.twins.samplers import RampSampler
-from retwin.twins.system_faults import ActuatorGain
+from retwin.twins.commands.samplers import RampSampler
+from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_from
+from retwin.twins.faults.system_faults import ActuatorGain
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.missed_segments import LatentPrior, fitted

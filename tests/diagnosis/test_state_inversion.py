@@ -30,7 +30,7 @@ from retwin.twins import (
     draw_faults,
     faulty_commands,
 )
-from retwin.twins.system_faults import measured_with
+from retwin.twins.faults.system_faults import measured_with
 from retwin.update import Dynamics, Library, fit_dynamics
 
 pytestmark = pytest.mark.slow  # they stand on one long fit

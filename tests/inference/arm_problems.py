@@ -11,7 +11,7 @@ from torch import Tensor
 
 import retwin as rt
 from retwin.nets.mixtures import Bernoullis, GaussianMixture
-from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from
+from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_from
 
 FROZEN = Path(__file__).with_name("frozen.npz")
 """Results of the three solvers that the engine replaced, with their inputs."""

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from retwin.errors import InputError
-from retwin.monitor.samples import Samples
+from retwin.monitor.store.samples import Samples
 
 PATIENCE = 30.0  # s
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from retwin.errors import InputError
 from retwin.monitor import Entry, export_log, read_log, verify
-from retwin.monitor.audit import MAX_LINE, START, append, canonical
+from retwin.monitor.store.audit import MAX_LINE, START, append, canonical
 
 HOSTILE = "</script>\n\0\ud800 Ω'\"; --"
 

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 from scipy.stats import laplace, t, uniform
 
 from retwin.monitor import Detector, Scale, Slack
-from retwin.monitor.bets import CLIP, Alternative
+from retwin.monitor.detect.bets import CLIP, Alternative
 
 # Gaussian quantiles between the edges of the grid, and their probabilities.
 STEPS = np.arange(-8 * 1280, 8 * 1280 + 1) / 1280

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from retwin.monitor.decision import SIGNIFICANCE, Decision, FalseAlarmTest
-from retwin.monitor.detector import Detector
-from retwin.monitor.events import CERTAIN, Course, Rules
-from retwin.monitor.promise import Tried, shortest
-from retwin.monitor.slack import Slack
-from retwin.monitor.validity import Validity
+from retwin.monitor.detect.detector import Detector
+from retwin.monitor.detect.events import CERTAIN, Course, Rules
+from retwin.monitor.detect.promise import SIGNIFICANCE, FalseAlarmTest, Tried, shortest
+from retwin.monitor.detect.slack import Slack
+from retwin.monitor.detect.validity import Validity
+from retwin.monitor.versions.decision import Decision
 
 RULES = Rules(arl=1000.0, wanted=5, lasting=20)
 

@@ -26,12 +26,12 @@ from retwin.monitor import (
     fit_monitor,
     verify,
 )
-from retwin.monitor.layout import Layout
-from retwin.monitor.machine import Counts
+from retwin.monitor.live.layout import Layout
+from retwin.monitor.live.machine import Counts
+from retwin.monitor.live.stream_machine import PLACES, StreamMachine
 from retwin.monitor.program import _offer
 from retwin.monitor.settings import TwinSettings
-from retwin.monitor.stream_machine import PLACES, StreamMachine
-from retwin.monitor.updates import Asset, Update
+from retwin.monitor.store.updates import Asset, Update
 from retwin.twins import Parameter, ParameterShift, State, StateTwin
 from retwin.update import Dynamics, Library, fit_dynamics
 

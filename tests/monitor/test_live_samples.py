@@ -9,7 +9,7 @@ import pytest
 
 from retwin.errors import InputError
 from retwin.monitor import Samples
-from retwin.monitor.samples import parse
+from retwin.monitor.store.samples import parse
 
 CHANNELS = {"line1": ("heater", "T1"), "line2": ("T1",)}
 

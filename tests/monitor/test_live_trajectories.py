@@ -23,15 +23,15 @@ import retwin as rt
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor import Explanations, Gate, Live, Registry, Samples, Store, export_log, verify
-from retwin.monitor.machine import Counts
+from retwin.monitor.live.machine import Counts
+from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
+from retwin.monitor.models.trajectories import TrajectoryMonitor
+from retwin.monitor.models.trajectory_fitting import fit_trajectory_monitor
 from retwin.monitor.program import run
-from retwin.monitor.samples import SECOND, Trajectory, parse
 from retwin.monitor.server import create_app, listening, serving
 from retwin.monitor.settings import FolderSource, read_settings
 from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
-from retwin.monitor.trajectories import TrajectoryMonitor
-from retwin.monitor.trajectory_fitting import fit_trajectory_monitor
-from retwin.monitor.trajectory_machine import Diagnosed, TrajectoryMachine
+from retwin.monitor.store.samples import SECOND, Trajectory, parse
 from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics
 

@@ -9,14 +9,14 @@ import pytest
 
 import retwin as rt
 from retwin.errors import InputError
-from retwin.monitor.cause import find_causes, possible_causes
-from retwin.monitor.detector import Detector
-from retwin.monitor.fitting import fit_monitor
-from retwin.monitor.monitor import Monitor
-from retwin.monitor.monitor_state import MonitorState
-from retwin.monitor.predictors import SLOWER, agreeing
-from retwin.monitor.slack import Slack
-from retwin.monitor.watched import Watched
+from retwin.monitor.detect.detector import Detector
+from retwin.monitor.detect.predictors import SLOWER, agreeing
+from retwin.monitor.detect.slack import Slack
+from retwin.monitor.models.cause import find_causes, possible_causes
+from retwin.monitor.models.fitting import fit_monitor
+from retwin.monitor.models.monitor import Monitor
+from retwin.monitor.models.monitor_state import MonitorState
+from retwin.monitor.models.watched import Watched
 from retwin.twins import (
     ActuatorGain,
     Parameter,
@@ -27,7 +27,7 @@ from retwin.twins import (
     StateTwin,
     Stuck,
 )
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
 
 RATE = 10.0
@@ -335,9 +335,9 @@ def test_evidence_is_the_mean_of_two_models(
     assert len(monitor.slack) == 2 * len(twin.outputs)
     assert [each.process for each in monitor.predictors] == [1.0, SLOWER]
     assert "slower" in str(monitor.promises["pressure"])
-    monkeypatch.setattr("retwin.monitor.fitting.SLOWER", 1.0)  # the same model twice
+    monkeypatch.setattr("retwin.monitor.models.fitting.SLOWER", 1.0)  # the same model twice
     twice = fit_monitor(twin, record(2, 1), "1 per hour")
-    monkeypatch.setattr("retwin.monitor.fitting._slower", lambda *_: [])
+    monkeypatch.setattr("retwin.monitor.models.fitting._slower", lambda *_: [])
     once = fit_monitor(twin, record(2, 1), "1 per hour")
     found = [each.watch(leaking()) for each in (once, twice)]
     np.testing.assert_allclose(found[1].evidence, found[0].evidence, rtol=1e-9)

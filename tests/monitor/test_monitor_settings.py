@@ -11,8 +11,8 @@ import jsonschema
 import pytest
 
 from retwin.errors import InputError
-from retwin.monitor.audit import read_log, verify
 from retwin.monitor.settings import MqttSource, read_settings, secret
+from retwin.monitor.store.audit import read_log, verify
 
 DOCS = Path(__file__).parents[2] / "docs"
 LEAST = """

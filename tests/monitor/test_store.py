@@ -15,7 +15,7 @@ import pytest
 
 from retwin.errors import InputError
 from retwin.monitor import Asset, Store, Update, verify
-from retwin.monitor.store import FILE
+from retwin.monitor.store.store import FILE
 
 Open = Callable[..., Store]
 LATEST = 2**63 - 1
@@ -141,7 +141,7 @@ def test_a_commit_is_stored_whole_or_not_at_all(opened: Open) -> None:
 
 
 def test_long_reads_come_in_parts(opened: Open, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("retwin.monitor.store.ROWS", 16)
+    monkeypatch.setattr("retwin.monitor.store.store.ROWS", 16)
     store = opened()
     store.add_asset(Asset("pump", 2))
     entries = [("odd" if n % 2 else "even", {"n": n}) for n in range(40)]
@@ -230,7 +230,7 @@ def test_a_broken_connection_is_one_error_and_then_made_anew(
 
 
 def test_a_store_of_a_newer_schema_is_refused(opened: Open) -> None:
-    from retwin.monitor.database import meta
+    from retwin.monitor.store.database import meta
 
     store = opened()
     with store._writing() as connection:
@@ -242,7 +242,7 @@ def test_a_store_of_a_newer_schema_is_refused(opened: Open) -> None:
 
 
 def test_settings_of_durability(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from retwin.monitor import database
+    from retwin.monitor.store import database
 
     with Store(tmp_path) as store, store._writing() as connection:
         found = {
@@ -261,7 +261,7 @@ def test_settings_of_durability(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_a_server_that_does_not_promise_durability(
     new_database: Callable[[], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from retwin.monitor import database
+    from retwin.monitor.store import database
 
     monkeypatch.setitem(database.SERVER, "fsync", "what this server has not")
     with pytest.raises(InputError, match="got fsync=on; change the settings of the server"):

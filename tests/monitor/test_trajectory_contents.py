@@ -9,13 +9,13 @@ from monitor.test_trajectory_monitor import TANK, runs
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
-from retwin.monitor.offsets import OffsetModel, fit_offsets
-from retwin.monitor.trajectories import TrajectoryMonitor
-from retwin.monitor.trajectory_evidence import checked
-from retwin.monitor.trajectory_fitting import fit_trajectory_monitor
-from retwin.monitor.trajectory_state import TrajectoryState
+from retwin.monitor.detect.offsets import OffsetModel, fit_offsets
+from retwin.monitor.models.trajectories import TrajectoryMonitor
+from retwin.monitor.models.trajectory_evidence import checked
+from retwin.monitor.models.trajectory_fitting import fit_trajectory_monitor
+from retwin.monitor.models.trajectory_state import TrajectoryState
 from retwin.twins import ActuatorGain, ParameterShift
-from retwin.twins.faults import ActuatorBias
+from retwin.twins.faults.actuator_faults import ActuatorBias
 from retwin.update import Dynamics, Library, fit_dynamics
 
 

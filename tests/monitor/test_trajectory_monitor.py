@@ -10,10 +10,10 @@ import pytest
 import retwin as rt
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
-from retwin.monitor.trajectories import TrajectoryMonitor
-from retwin.monitor.trajectory_fitting import fit_trajectory_monitor
+from retwin.monitor.models.trajectories import TrajectoryMonitor
+from retwin.monitor.models.trajectory_fitting import fit_trajectory_monitor
 from retwin.twins import ActuatorGain, Parameter, ParameterShift, SensorBias, State, StateTwin
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.update import Dynamics, Library, fit_dynamics
 
 pytestmark = pytest.mark.slow  # the command line's test is fast

@@ -23,7 +23,7 @@ from retwin.study.pool import run_jobs
 from retwin.study.progress import Stages
 from retwin.study.work import Work
 from retwin.twins.function import FunctionTwin
-from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
 from retwin.update.corrections import Additive
 from retwin.update.residual import SequenceMixture
 

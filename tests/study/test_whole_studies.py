@@ -14,8 +14,8 @@ import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.catalog import SOURCES
 from retwin.study import possible_sources
-from retwin.twins.command_side import CommandSide, command_side_parameters
-from retwin.twins.parametric import ParametricTwin
+from retwin.twins.wrappers.command_side import CommandSide, command_side_parameters
+from retwin.twins.wrappers.parametric import ParametricTwin
 
 pytestmark = pytest.mark.slow
 

@@ -17,9 +17,9 @@ from fmus import c_fmu
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.testing import TWIN_CHECKS, TwinSubject, check_twin
-from retwin.twins.fmu import FMUTwin
+from retwin.twins.fmu.twin import FMUTwin
 from retwin.twins.function import FunctionTwin
-from retwin.twins.mujoco import MuJoCoTwin
+from retwin.twins.mujoco.twin import MuJoCoTwin
 from retwin.twins.workers import keep_workers
 
 Subject = Callable[[pytest.FixtureRequest], TwinSubject]

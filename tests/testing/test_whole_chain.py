@@ -23,8 +23,8 @@ import retwin as rt
 from retwin.data.trajectories import HEALTHY
 from retwin.nets.networks import LSTM
 from retwin.nets.training import Training
+from retwin.twins.commands.samplers import RampSampler
 from retwin.twins.function import FunctionTwin
-from retwin.twins.samplers import RampSampler
 from retwin.update.corrections import Additive
 from retwin.update.residual import Density, SequenceMixture
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.twins.command_range import CommandRange, extremes, part_of
+from retwin.twins.commands.range import CommandRange, extremes, part_of
 from retwin.twins.compiled import commands as compiled_commands
 
 RATE, STEPS = 610.0, 610

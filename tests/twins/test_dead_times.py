@@ -13,7 +13,7 @@ import retwin as rt
 from retwin import compiler
 from retwin.errors import InputError
 from retwin.twins import Parameter, ParameterShift, State, StateTwin
-from retwin.twins.interpolation import INTERPOLATIONS
+from retwin.twins.equations.interpolation import INTERPOLATIONS
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
 from retwin.update.dynamics.online import OnlineFilter
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from retwin import ActuatorBias, InputError, Segments, Stuck
-from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_response
+from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_response
 
 RATE = 50.0
 

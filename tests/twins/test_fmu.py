@@ -21,9 +21,9 @@ import pytest
 from fmus import c_fmu, changed, described, python_fmu
 
 import retwin as rt
-from retwin.twins.fmu import FMUTwin
-from retwin.twins.parametric import Parameter, ParametricTwin
-from retwin.twins.randomised import RandomisedTwin
+from retwin.twins.fmu.twin import FMUTwin
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
+from retwin.twins.wrappers.randomised import RandomisedTwin
 
 TAU = 0.1
 RATE = 100.0
@@ -474,7 +474,7 @@ def test_members_stay_in_the_folder(
 SCRIPT = """
 import numpy as np
 from retwin.deploy.simulations import SimulationPlan, simulate_to
-from retwin.twins.fmu import FMUTwin
+from retwin.twins.fmu.twin import FMUTwin
 
 if __name__ == "__main__":
     twin = FMUTwin.from_file({path!r}, 100.0, ["u", "trouble"], ["x"])

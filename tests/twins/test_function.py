@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.twins.applied_faults import faulty_commands, frozen_response
+from retwin.twins.faults.applied_faults import faulty_commands, frozen_response
 from retwin.twins.function import TRAJECTORIES_PER_CHUNK, FunctionTwin
 
 INPUTS = rt.Channels(("valve", "heater"), ("1", "W"))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.twins.mujoco import MuJoCoTwin, Servo
+from retwin.twins.mujoco.twin import MuJoCoTwin, Servo
 
 PENDULUM = """
 <mujoco>

@@ -14,10 +14,10 @@ import retwin as rt
 from retwin.cases.armpi_fpv.parameters import armpi_parametric
 from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.testing import TWIN_CHECKS, TwinSubject
-from retwin.twins.command_side import CommandSide, command_side_parameters
 from retwin.twins.function import FunctionTwin
-from retwin.twins.mujoco import MuJoCoTwin
-from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.mujoco.twin import MuJoCoTwin
+from retwin.twins.wrappers.command_side import CommandSide, command_side_parameters
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
 
 CHANNEL = rt.Channels(("u",), ("V",))
 LEVEL = rt.Channels(("y",), ("m",))

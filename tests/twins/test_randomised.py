@@ -13,11 +13,11 @@ import retwin as rt
 from retwin.cases.armpi_fpv.parameters import armpi_parametric
 from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.testing import TWIN_CHECKS, TwinSubject
-from retwin.twins.command_side import CommandSide, command_side_parameters
 from retwin.twins.function import FunctionTwin
-from retwin.twins.noisy import NoisyTwin, residual_scale
-from retwin.twins.parametric import ParametricTwin
-from retwin.twins.randomised import RandomisedTwin
+from retwin.twins.wrappers.command_side import CommandSide, command_side_parameters
+from retwin.twins.wrappers.noisy import NoisyTwin, residual_scale
+from retwin.twins.wrappers.parametric import ParametricTwin
+from retwin.twins.wrappers.randomised import RandomisedTwin
 
 CHANNEL = rt.Channels(("u",), ("V",))
 LEVELS = rt.Channels(("y", "p"), ("m", "bar"))

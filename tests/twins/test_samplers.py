@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.twins.ramps import ramps_and_holds
-from retwin.twins.samplers import (
+from retwin.twins.commands.ramps import ramps_and_holds
+from retwin.twins.commands.samplers import (
     HoldSampler,
     MultisineSampler,
     RampSampler,

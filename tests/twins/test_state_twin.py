@@ -15,7 +15,7 @@ from retwin import compiler
 from retwin.evaluation.fidelity.simulation import simulate_records
 from retwin.testing import TWIN_CHECKS, TwinSubject
 from retwin.twins import Parameter, ParametricTwin, State, StateTwin
-from retwin.twins.interpolation import INTERPOLATIONS, cubic_coefficients
+from retwin.twins.equations.interpolation import INTERPOLATIONS, cubic_coefficients
 from retwin.update.identification import LeastSquares, identify
 
 VOLTAGE = rt.Channels(("pump",), ("V",))

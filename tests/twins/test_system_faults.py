@@ -209,7 +209,7 @@ def test_a_case_file_has_faults_of_the_system(tmp_path) -> None:
 
 def test_a_fault_is_saved_by_name() -> None:
     from retwin.serialisation.configs import from_config, to_config
-    from retwin.twins.system_faults import FAULTS
+    from retwin.twins.faults.system_faults import FAULTS
 
     fault = SensorDrift(1, size=(0.1, 0.2), onset=(1.0, 2.0), end=3.0, label="drift")
     assert from_config(to_config(fault, FAULTS), FAULTS) == fault

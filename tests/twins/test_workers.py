@@ -12,7 +12,7 @@ import pytest
 from fmus import c_fmu
 
 import retwin as rt
-from retwin.twins.fmu import FMUTwin
+from retwin.twins.fmu.twin import FMUTwin
 from retwin.twins.function import FunctionTwin
 from retwin.twins.workers import keep_workers
 

@@ -16,10 +16,10 @@ from torch.overrides import TorchFunctionMode
 
 import retwin as rt
 from retwin.nets.networks import LSTM
-from retwin.twins.command_range import CommandRange
-from retwin.twins.faults import ActuatorBias, Fault, Stuck
-from retwin.twins.ramps import ramps_and_holds
-from retwin.twins.system_faults import ActuatorGain, SensorBias
+from retwin.twins.commands.ramps import ramps_and_holds
+from retwin.twins.commands.range import CommandRange
+from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
+from retwin.twins.faults.system_faults import ActuatorGain, SensorBias
 from retwin.update import Additive, DeviceTwin, OutsideTrainingWarning, SequenceResidual
 from retwin.update import device as made_on
 from retwin.update.kernels import generation

@@ -13,10 +13,10 @@ import torch
 
 import retwin as rt
 from retwin.nets.networks import MLP
-from retwin.twins.applied_faults import faulty_commands
+from retwin.twins.commands.ramps import ramps_and_holds
 from retwin.twins.compiled import commands as compiled_commands
-from retwin.twins.faults import ActuatorBias
-from retwin.twins.ramps import ramps_and_holds
+from retwin.twins.faults.actuator_faults import ActuatorBias
+from retwin.twins.faults.applied_faults import faulty_commands
 from retwin.update.corrections import Context
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from retwin.twins.samplers import HoldSampler, MultisineSampler, RampSampler
+from retwin.twins.commands.samplers import HoldSampler, MultisineSampler, RampSampler
 from retwin.update.piecewise_linear import evaluate_piecewise_linear
 
 pytestmark = pytest.mark.numerical

@@ -12,7 +12,7 @@ from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
 from retwin.checks import one_of, require
 from retwin.serialisation.configs import at, from_settings, key, read_toml
-from retwin.twins.parametric import Parameter
+from retwin.twins.wrappers.parametric import Parameter
 
 CONTENTS = "see docs/own_twin.md for what it holds"
 

@@ -15,12 +15,12 @@ from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.nets.networks import MLP, Network
 from retwin.nets.training import Training
 from retwin.progress import Progress
-from retwin.twins.faults import Fault, Stuck
-from retwin.twins.parametric import ParametricTwin
-from retwin.twins.samplers import CommandSampler
-from retwin.twins.system_faults import TimedFault
+from retwin.twins.commands.samplers import CommandSampler
+from retwin.twins.faults.actuator_faults import Fault, Stuck
+from retwin.twins.faults.system_faults import TimedFault
 from retwin.twins.twin import Twin
-from retwin.twins.wrapper import OfTwin
+from retwin.twins.wrappers.parametric import ParametricTwin
+from retwin.twins.wrappers.wrapper import OfTwin
 from retwin.update.corrections import Correction
 from retwin.update.dynamics import Dynamics, state_names
 from retwin.update.residual import Density, Mixture, SequenceMixture

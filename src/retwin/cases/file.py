@@ -36,20 +36,20 @@ from retwin.serialisation.configs import (
 )
 from retwin.serialisation.places import real_path
 from retwin.times import sample_rate
-from retwin.twins.faults import Fault
-from retwin.twins.fmu import FMUTwin
-from retwin.twins.limits import Limits
-from retwin.twins.mujoco import MuJoCoTwin
-from retwin.twins.record_sampler import sampler_from
-from retwin.twins.samplers import (
+from retwin.twins.commands.record_sampler import sampler_from
+from retwin.twins.commands.samplers import (
     CommandSampler,
     HoldSampler,
     MultisineSampler,
     RampSampler,
     RecordedSampler,
 )
-from retwin.twins.state_twin import StateTwin
-from retwin.twins.system_faults import FAULTS, check_faults
+from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.faults.system_faults import FAULTS, check_faults
+from retwin.twins.fmu.twin import FMUTwin
+from retwin.twins.limits import Limits
+from retwin.twins.mujoco.twin import MuJoCoTwin
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Correction, DelayOffset
 from retwin.update.dynamics import Dynamics

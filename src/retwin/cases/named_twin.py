@@ -16,13 +16,13 @@ from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.modules import import_beside
 from retwin.serialisation.configs import at, checked, from_settings, key
-from retwin.twins.fmu import FMUTwin
+from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.fmu.twin import FMUTwin
 from retwin.twins.function import FunctionTwin
 from retwin.twins.limits import Limits
-from retwin.twins.mujoco import MuJoCoTwin, Servo
-from retwin.twins.parametric import Parameter, ParametricTwin
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.mujoco.twin import MuJoCoTwin, Servo
 from retwin.twins.twin import Twin
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
 
 FILES: dict[str, Any] = {".fmu": FMUTwin, ".xml": MuJoCoTwin, ".urdf": MuJoCoTwin}
 """The kind of twin that a file of each suffix holds."""

@@ -14,15 +14,15 @@ from retwin.cases.case import Case
 from retwin.cases.named_twin import parametric_twin
 from retwin.checks import nothing, require
 from retwin.errors import InputError
-from retwin.twins.fmu import FMUTwin
-from retwin.twins.fmu_model import adjustable, read_description
+from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.fmu.model import adjustable, read_description
+from retwin.twins.fmu.twin import FMUTwin
 from retwin.twins.function import FunctionTwin
-from retwin.twins.mujoco import MuJoCoTwin
-from retwin.twins.mujoco_parameters import parameter_value, suggested_parameters
-from retwin.twins.parametric import Parameter, ParametricTwin
-from retwin.twins.rebuilt import RebuiltTwin
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.mujoco.parameters import parameter_value, suggested_parameters
+from retwin.twins.mujoco.twin import MuJoCoTwin
 from retwin.twins.twin import Twin
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
+from retwin.twins.wrappers.rebuilt import RebuiltTwin
 
 SHOWN = 24
 """Parameters that a message lists, at most."""

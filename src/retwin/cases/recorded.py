@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.twin import Twin
-from retwin.twins.wrapper import OfTwin
+from retwin.twins.wrappers.wrapper import OfTwin
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from retwin.cases.opened_twin import OpenedTwin
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.configs import toml_text
-from retwin.twins.parametric import ParametricTwin
-from retwin.twins.record_sampler import moves_and_rests
+from retwin.twins.commands.record_sampler import moves_and_rests
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics import state_names
 
 STEP = 2

@@ -64,7 +64,7 @@ def fit(
 ) -> None:
     """Calibrate a monitor on healthy records."""
     from retwin.monitor import fit_monitor
-    from retwin.monitor.promise import duration
+    from retwin.monitor.detect.promise import duration
     from retwin.update import DynamicsTwin
 
     check_place(out, folder=True, holds=("model.json", "weights.safetensors", "twin", "diagnoser"))
@@ -288,7 +288,7 @@ def audit(
 ) -> None:
     """Verify the log of a store, and the files of its versions."""
     from retwin.monitor import Store, read_log, verify
-    from retwin.monitor.registry import damaged
+    from retwin.monitor.versions.registry import damaged
 
     require(
         head is None or re.fullmatch("[0-9a-f]{64}", head),
@@ -344,7 +344,7 @@ def _causes(
 
 def _written(cause: Cause) -> str:
     """A cause with its onset, and whether there is more to it."""
-    from retwin.monitor.cause import cause_text
+    from retwin.monitor.models.cause import cause_text
 
     since = "" if isnan(cause.onset[0]) else f"{cause.onset[0]:.6g} s"
     return cause_text(cause.name, since, cause.unknown)
@@ -397,7 +397,7 @@ def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
 
 def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> str:
     """The rate that was seen, with its exact bound, and the one that is promised."""
-    from retwin.monitor.promise import duration, shortest
+    from retwin.monitor.detect.promise import duration, shortest
 
     rate = monitor.twin.rate
     samples = sum(int(record.mask.any(axis=2).sum()) for record, _ in found)

@@ -217,7 +217,7 @@ def _twin(
 
 def _servo(text: str) -> tuple[str, Any]:
     """A joint and its servo, from "JOINT=STIFFNESS,DAMPING"."""
-    from retwin.twins.mujoco import Servo
+    from retwin.twins.mujoco.twin import Servo
 
     joint, _, gains = text.rpartition("=")
     try:
@@ -302,7 +302,7 @@ def _sampler(system: Case | None, found: Twin, duration: float | None) -> Any:
     duration = given("--duration", duration, expected, remedy=remedy)
     import numpy as np
 
-    from retwin.twins.samplers import RampSampler
+    from retwin.twins.commands.samplers import RampSampler
 
     if not len(found.inputs):  # nothing to draw
         return np.zeros((1, max(2, to_samples(duration, found.rate)), 0))

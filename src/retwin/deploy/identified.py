@@ -25,8 +25,8 @@ from retwin.evaluation.identification.parameters import spread_of
 from retwin.report.identification import identification_page
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place
-from retwin.twins.fmu import FMUTwin
-from retwin.twins.parametric import ParametricTwin
+from retwin.twins.fmu.twin import FMUTwin
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.agreement import check_with_twin
 from retwin.update.identification.posterior import Posterior
 

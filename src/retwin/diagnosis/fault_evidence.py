@@ -16,8 +16,8 @@ from scipy.special import logsumexp
 
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.adaptive_grid import Integral, integrated
-from retwin.twins.faults import ends_of
-from retwin.twins.system_faults import (
+from retwin.twins.faults.actuator_faults import ends_of
+from retwin.twins.faults.system_faults import (
     ActuatorGain,
     ParameterFault,
     SensorBias,

@@ -18,7 +18,7 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.diagnosis.latent_prior import command_problem, healthy_prior
 from retwin.errors import InputError
-from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
 from retwin.update.corrections import Context
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.missed_segments import LatentPrior

@@ -33,7 +33,7 @@ from retwin.inference.noise import Noise
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
-from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
 from retwin.twins.twin import Twin
 from retwin.update.corrections.missed_segments import CommandFit
 from retwin.update.exact import exact_surrogate, load_surrogate

@@ -23,7 +23,7 @@ from retwin.diagnosis.samples import DiagnosisInputs
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.inference.noise import Noise
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Context

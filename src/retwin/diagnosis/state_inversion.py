@@ -24,8 +24,8 @@ from retwin.diagnosis.fault_evidence import NOTHING, FaultEvidence
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
-from retwin.twins.faults import Fault
-from retwin.twins.system_faults import FAULTS, TimedFault, check_faults
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.faults.system_faults import FAULTS, TimedFault, check_faults
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics import DynamicsTwin
 from retwin.workers.threads import in_threads

@@ -18,17 +18,17 @@ from scipy.signal import lfilter
 from retwin.cases import get
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
 from retwin.data.trajectories import Trajectories
-from retwin.monitor.explanations import Explanations
-from retwin.monitor.fitting import fit_monitor
-from retwin.monitor.gate import Gate
-from retwin.monitor.live import Live
-from retwin.monitor.monitor import Monitor
-from retwin.monitor.registry import Registry
-from retwin.monitor.samples import Samples
-from retwin.monitor.store import Store
-from retwin.twins.faults import Fault
-from retwin.twins.samplers import HoldSampler
-from retwin.twins.system_faults import ActuatorGain, ParameterShift, SensorBias
+from retwin.monitor.live.explanations import Explanations
+from retwin.monitor.live.gate import Gate
+from retwin.monitor.live.live import Live
+from retwin.monitor.models.fitting import fit_monitor
+from retwin.monitor.models.monitor import Monitor
+from retwin.monitor.store.samples import Samples
+from retwin.monitor.store.store import Store
+from retwin.monitor.versions.registry import Registry
+from retwin.twins.commands.samplers import HoldSampler
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.faults.system_faults import ActuatorGain, ParameterShift, SensorBias
 from retwin.update import Dynamics, Library, fit_dynamics
 
 CASE = "incubator"

@@ -16,14 +16,12 @@ from retwin.cases.case import Case
 from retwin.checks import require
 from retwin.data.logs.mapping import read_mapping
 from retwin.errors import InputError
-from retwin.monitor.audit import Entry
-from retwin.monitor.cause import cause_text, cause_title
-from retwin.monitor.explanations import Explanations
-from retwin.monitor.gate import Gate
-from retwin.monitor.kinds import AnyMonitor, load_monitor
-from retwin.monitor.live import Live
-from retwin.monitor.registry import Registry
-from retwin.monitor.samples import SECOND
+from retwin.monitor.live.explanations import Explanations
+from retwin.monitor.live.gate import Gate
+from retwin.monitor.live.live import Live
+from retwin.monitor.models.cause import cause_text, cause_title
+from retwin.monitor.models.kinds import AnyMonitor, load_monitor
+from retwin.monitor.models.trajectories import TrajectoryMonitor
 from retwin.monitor.server import create_app, listening, serving
 from retwin.monitor.server.app import check_token
 from retwin.monitor.settings import (
@@ -41,10 +39,12 @@ from retwin.monitor.sources.opcua import OpcUa
 from retwin.monitor.sources.source import Source
 from retwin.monitor.sources.tables import Layout
 from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
-from retwin.monitor.store import Store
-from retwin.monitor.trajectories import TrajectoryMonitor
+from retwin.monitor.store.audit import Entry
+from retwin.monitor.store.samples import SECOND
+from retwin.monitor.store.store import Store
+from retwin.monitor.versions.registry import Registry
 from retwin.serialisation.files import sha256
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 
 REMEDY = "If it is healthy, recalibrate: what follows are remarks, and no alarms, until then"
 """What to do where a promise is void."""

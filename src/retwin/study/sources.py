@@ -16,9 +16,9 @@ from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import DANN, FineTune, FittedDiagnoser, Rocket, fit_diagnoser, fit_inversion
 from retwin.study.plan import StudyPlan
 from retwin.study.trial import Trial
-from retwin.twins.noisy import NoisyTwin, residual_scale
-from retwin.twins.randomised import RandomisedTwin
 from retwin.twins.twin import Twin
+from retwin.twins.wrappers.noisy import NoisyTwin, residual_scale
+from retwin.twins.wrappers.randomised import RandomisedTwin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics import DynamicsTwin, state_names
 from retwin.update.residual import ResidualModel, SequenceMixture

@@ -17,8 +17,8 @@ from retwin.progress import Progress
 from retwin.serialisation.models import read_about
 from retwin.study.files import Files, Job
 from retwin.study.plan import StudyPlan
-from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Twin
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.blackbox import BLACK_BOXES
 from retwin.update.corrected import CorrectedTwin, generate
 from retwin.update.corrections import Correction

@@ -38,7 +38,7 @@ from retwin.study.estimates import write_estimates
 from retwin.study.files import Files, Job, Roles
 from retwin.study.plan import StudyPlan
 from retwin.study.trial import Trial
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.twin import Twin
 from retwin.update.blackbox import BLACK_BOXES, fit_black_box
 from retwin.update.corrected import CorrectedTwin, generate

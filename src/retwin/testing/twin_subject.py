@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
-from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_response
-from retwin.twins.faults import Fault, Stuck
+from retwin.twins.faults.actuator_faults import Fault, Stuck
+from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_response
 from retwin.twins.twin import Twin
 
 

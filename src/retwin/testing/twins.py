@@ -19,7 +19,7 @@ from retwin.testing.suite import (
     run_checks,
 )
 from retwin.testing.twin_subject import TwinSubject
-from retwin.twins.faults import Fault, Stuck
+from retwin.twins.faults.actuator_faults import Fault, Stuck
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Twin
 from retwin.twins.workers import keep_workers

@@ -22,28 +22,29 @@ if TYPE_CHECKING:  # one kind of twin does not load what another kind needs
 
 _HOME = homes(
     {
-        "applied_faults": "draw_faults faulty_commands frozen_response",
         "collected": "SimulationError",
-        "command_side": "CommandSide command_side_parameters",
-        "faults": "ActuatorBias Fault Stuck",
-        "fmu": "FMUTwin",
+        "commands.record_sampler": "sampler_from",
+        "commands.samplers": "CommandSampler HoldSampler MultisineSampler RampSampler "
+        "RecordedSampler",
+        "equations.state": "State",
+        "equations.state_twin": "StateTwin",
+        "equations.step_error": "StepWarning",
+        "faults.actuator_faults": "ActuatorBias Fault Stuck",
+        "faults.applied_faults": "draw_faults faulty_commands frozen_response",
+        "faults.system_faults": "ActuatorGain ParameterDrift ParameterShift SensorBias SensorDrift "
+        "SensorFreeze",
+        "fmu.twin": "FMUTwin",
         "function": "FunctionTwin",
         "limits": "Limits",
-        "mujoco": "MuJoCoTwin Servo",
-        "noisy": "NoisyTwin residual_scale",
-        "parametric": "Parameter ParametricTwin",
-        "randomised": "RandomisedTwin",
-        "record_sampler": "sampler_from",
-        "samplers": "CommandSampler HoldSampler MultisineSampler RampSampler RecordedSampler",
-        "state": "State",
-        "state_twin": "StateTwin",
-        "step_error": "StepWarning",
+        "mujoco.twin": "MuJoCoTwin Servo",
         "system": "System",
-        "system_faults": "ActuatorGain ParameterDrift ParameterShift SensorBias SensorDrift "
-        "SensorFreeze",
         "twin": "Chunk Twin simulate_in_chunks",
         "workers": "keep_workers",
-        "wrapper": "TwinWrapper",
+        "wrappers.command_side": "CommandSide command_side_parameters",
+        "wrappers.noisy": "NoisyTwin residual_scale",
+        "wrappers.parametric": "Parameter ParametricTwin",
+        "wrappers.randomised": "RandomisedTwin",
+        "wrappers.wrapper": "TwinWrapper",
     }
 )
 
@@ -113,10 +114,10 @@ def get(
         options["rate"] = rate
     if suffix == ".fmu":
         _check_none(name, {each: options[each] for each in ("meshes", "servos") if each in options})
-        from retwin.twins.fmu import FMUTwin
+        from retwin.twins.fmu.twin import FMUTwin
 
         return FMUTwin.from_file(name, outside=outside, **options)
-    from retwin.twins.mujoco import MuJoCoTwin
+    from retwin.twins.mujoco.twin import MuJoCoTwin
 
     return MuJoCoTwin.from_file(name, outside=outside, **options)
 

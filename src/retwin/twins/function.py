@@ -19,7 +19,7 @@ from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.times import sample_rate
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, simulate_in_chunks
 from retwin.twins.workers import worker_processes

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-from retwin.twins.faults import Fault
-from retwin.twins.samplers import CommandSampler
+from retwin.twins.commands.samplers import CommandSampler
+from retwin.twins.faults.actuator_faults import Fault
 
 
 class System(Protocol):

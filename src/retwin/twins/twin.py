@@ -17,11 +17,16 @@ from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Channels, Trajectories
 from retwin.progress import Progress
 from retwin.times import stride_of
-from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from, frozen_response
 from retwin.twins.collected import Collected
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.faults.applied_faults import (
+    draw_faults,
+    faulty_commands,
+    frozen_from,
+    frozen_response,
+)
+from retwin.twins.faults.system_faults import check_faults, measured_with
 from retwin.twins.limits import Limits
-from retwin.twins.system_faults import check_faults, measured_with
 from retwin.workers.threads import Turns, in_threads
 
 

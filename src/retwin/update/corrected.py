@@ -16,7 +16,7 @@ from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import read_about, refusing, write_model
 from retwin.serialisation.sizes import Budget
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.system import System
 from retwin.twins.twin import (
     Chunk,

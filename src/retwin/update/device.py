@@ -19,10 +19,10 @@ from torch import Tensor
 from retwin.checks import instance, require, whole
 from retwin.data.segments import Segments
 from retwin.errors import InputError, brief
-from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from
-from retwin.twins.command_range import SMALLEST_POWER, CommandRange, chosen_for_spectra
-from retwin.twins.faults import Fault
-from retwin.twins.system_faults import TimedFault, check_faults, measured_with
+from retwin.twins.commands.range import SMALLEST_POWER, CommandRange, chosen_for_spectra
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_from
+from retwin.twins.faults.system_faults import TimedFault, check_faults, measured_with
 from retwin.twins.twin import checked_commands, checked_seed
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Context, measuring

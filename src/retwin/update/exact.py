@@ -16,12 +16,12 @@ from retwin import catalog
 from retwin.checks import given, require
 from retwin.progress import Progress
 from retwin.serialisation.models import kind_of, read_about, refusing, save_model
-from retwin.twins.parametric import Parameter, ParametricTwin
-from retwin.twins.saved_equations import equations_from, equations_of
-from retwin.twins.state import State
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.saved_equations import equations_from, equations_of
+from retwin.twins.equations.state import State
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import Twin
-from retwin.twins.wrapper import OfTwin
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
+from retwin.twins.wrappers.wrapper import OfTwin
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.surrogate import Surrogate

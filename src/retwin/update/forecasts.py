@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.twins.interpolation import TAPS
+from retwin.twins.equations.interpolation import TAPS
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive

@@ -22,8 +22,8 @@ from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, refusing, save_model
 from retwin.times import sample_rate
-from retwin.twins.command_range import CommandRange
-from retwin.twins.faults import Fault
+from retwin.twins.commands.range import CommandRange
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
 from retwin.update.kernels.generation import along_pieces
 from retwin.update.piecewise_linear import evaluate_piecewise_linear

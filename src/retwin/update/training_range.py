@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.twins.command_range import CommandRange
+from retwin.twins.commands.range import CommandRange
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -14,7 +14,7 @@ from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.cases.armpi_fpv.recovery import Recovery, recover_commands
 from retwin.cases.armpi_fpv.twin import KINEMATIC, RAMPS
 from retwin.errors import InputError
-from retwin.twins.ramps import ramps_and_holds
+from retwin.twins.commands.ramps import ramps_and_holds
 
 ARM = YawPitchArm(base=0.028505 + 0.0361, links=(0.10048, 0.094714, 0.05071))
 DATA = os.environ.get("RETWIN_DATA")

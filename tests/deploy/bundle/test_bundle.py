@@ -20,7 +20,7 @@ from retwin.deploy.bundle.bundle import Bundle
 from retwin.deploy.bundle.facts import Facts
 from retwin.deploy.bundle.seal import SUMS, read_sealed, seal, verify_seal
 from retwin.serialisation.files import sha256
-from retwin.twins.samplers import RampSampler
+from retwin.twins.commands.samplers import RampSampler
 
 Call = Callable[..., tuple[int, str, str]]
 

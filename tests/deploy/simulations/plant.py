@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 import retwin as rt
 from retwin.deploy.simulations import SimulationPlan, simulate_to
 from retwin.nets.training import Training
+from retwin.twins.commands.samplers import RampSampler
 from retwin.twins.function import FunctionTwin
-from retwin.twins.samplers import RampSampler
 from retwin.update.corrections import Additive
 
 HEADROOM = 2**27

@@ -31,7 +31,7 @@ from retwin.progress import Progress
 from retwin.serialisation.files import sha256
 from retwin.serialisation.identity import identity
 from retwin.twins.collected import SimulationError
-from retwin.twins.samplers import RampSampler
+from retwin.twins.commands.samplers import RampSampler
 from retwin.twins.twin import Chunk, simulate_in_chunks
 from retwin.workers.jobs import alone
 

@@ -16,7 +16,7 @@ from retwin.cases.armpi_fpv.emulator import _effective
 from retwin.cases.armpi_fpv.twin import KINEMATIC, RATE, SENSOR_RATE
 from retwin.errors import InputError
 from retwin.serialisation.configs import from_config, to_config
-from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from
+from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_from
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands
 

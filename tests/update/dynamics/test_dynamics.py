@@ -18,7 +18,7 @@ from retwin.errors import InputError
 from retwin.testing import TWIN_CHECKS, TwinSubject
 from retwin.twins import FunctionTwin, Parameter, State, StateTwin
 from retwin.twins.compiled import steps
-from retwin.twins.saved_equations import equations_from, equations_of
+from retwin.twins.equations.saved_equations import equations_from, equations_of
 from retwin.update import Dynamics, DynamicsTwin, Library, OutsideTrainingWarning, fit_dynamics
 from retwin.update.dynamics import FittedDynamics
 from retwin.update.dynamics.estimation import correlation_time

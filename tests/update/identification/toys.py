@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 
 import retwin as rt
 from retwin.twins.function import FunctionTwin
-from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.twin import Chunk, simulate_in_chunks
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
 
 INPUTS = rt.Channels(("u", "v"), ("1", "1"))
 OUTPUT = rt.Channels(("y",), ("m",))

@@ -25,8 +25,8 @@ from retwin.cases.armpi_fpv.twin import (
 from retwin.cases.case import Case
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.times import stride_of
-from retwin.twins.faults import ActuatorBias, Fault, Stuck
-from retwin.twins.ramps import draw_onsets, ramps_and_holds
+from retwin.twins.commands.ramps import draw_onsets, ramps_and_holds
+from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
 from retwin.twins.time_step import Timed
 from retwin.update.corrections import Chain, CommandSpace, DelayOffset, SampledSensor
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
-from retwin.twins.applied_faults import frozen_response
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.faults.applied_faults import frozen_response
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, simulate_in_chunks
 

@@ -22,9 +22,9 @@ from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.times import stride_of, to_samples
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.twin import Chunk, Twin, simulate_in_chunks
-from retwin.twins.wrapper import TwinWrapper
+from retwin.twins.wrappers.wrapper import TwinWrapper
 
 PROBABILITIES = ("missed", "glitch", "repeatable")
 """Settings whose range is 0 to 1."""

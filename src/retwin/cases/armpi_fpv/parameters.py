@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from retwin.cases.armpi_fpv.twin import KINEMATIC, STRAIGHT, ArmPiTwin
-from retwin.twins.command_side import CommandSide, command_side_parameters
-from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.wrappers.command_side import CommandSide, command_side_parameters
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
 
 SERVOS = tuple(f"actuator.motor_{i}" for i in range(1, 6))
 GAIN, DAMPING = 0.008, 0.000082

@@ -9,7 +9,7 @@ from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.cases.armpi_fpv.plane import LIMIT, STEP, TURN, Plane
 from retwin.cases.armpi_fpv.search import FLOOR, TIE, free_chain, grid_chain
 from retwin.cases.armpi_fpv.twin import KINEMATIC, RAMPS, STRAIGHT
-from retwin.twins.ramps import ramps_and_holds
+from retwin.twins.commands.ramps import ramps_and_holds
 
 HALF_TURN = TURN // 2
 """Command units in half a turn."""

@@ -15,11 +15,11 @@ from retwin.cases.armpi_fpv.closed_form import KinematicTwin, ServoLag
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.limits import Limits
 
 if TYPE_CHECKING:
-    from retwin.twins.mujoco import MuJoCoTwin
+    from retwin.twins.mujoco.twin import MuJoCoTwin
 
 
 ARM = YawPitchArm(base=0.028505 + 0.0361, links=(0.10048, 0.094714, 0.05071))
@@ -94,7 +94,7 @@ class ArmPiTwin:
     @cached_property
     def physics(self) -> MuJoCoTwin:
         """The MuJoCo model that simulates."""
-        from retwin.twins.mujoco import MuJoCoTwin
+        from retwin.twins.mujoco.twin import MuJoCoTwin
 
         return MuJoCoTwin(
             MODEL,

@@ -20,7 +20,7 @@ from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
 from retwin.nets.networks import LSTM
 from retwin.nets.training import Training
-from retwin.twins.samplers import MultisineSampler
+from retwin.twins.commands.samplers import MultisineSampler
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Additive
 from retwin.update.residual import SequenceMixture

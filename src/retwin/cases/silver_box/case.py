@@ -11,7 +11,7 @@ from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.silver_box.twin import SILVERBOX
 from retwin.nets.networks import LSTM
-from retwin.twins.samplers import MultisineSampler
+from retwin.twins.commands.samplers import MultisineSampler
 from retwin.update.corrections import Additive
 from retwin.update.residual import SequenceMixture
 

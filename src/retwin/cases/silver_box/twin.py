@@ -17,9 +17,9 @@ from __future__ import annotations
 from typing import Any
 
 from retwin.data.trajectories import Channels
-from retwin.twins.parametric import Parameter
-from retwin.twins.state import State
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state import State
+from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.wrappers.parametric import Parameter
 
 
 def _derivative(x: Any, u: Any, p: Any) -> tuple[Any, Any]:

@@ -14,9 +14,9 @@ from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
 from retwin.cases.time_column import TimeColumn
 from retwin.nets.networks import LSTM
-from retwin.twins.faults import Fault
-from retwin.twins.samplers import HoldSampler
-from retwin.twins.system_faults import (
+from retwin.twins.commands.samplers import HoldSampler
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.faults.system_faults import (
     ActuatorGain,
     ParameterShift,
     SensorBias,

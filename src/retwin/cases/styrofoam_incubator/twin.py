@@ -18,10 +18,10 @@ from __future__ import annotations
 from typing import Any
 
 from retwin.data.trajectories import Channels
+from retwin.twins.equations.state import State
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.limits import Limits
-from retwin.twins.parametric import Parameter
-from retwin.twins.state import State
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.wrappers.parametric import Parameter
 
 POWER = 100.0
 """Power of the heater in W, assumed: no record has it, and all four parameters are proportional."""

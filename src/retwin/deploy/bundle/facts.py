@@ -9,9 +9,9 @@ from typing import Any
 from retwin.checks import same_names, whole
 from retwin.serialisation.configs import from_config, to_config
 from retwin.times import sample_rate
-from retwin.twins.faults import Fault
-from retwin.twins.samplers import RampSampler
-from retwin.twins.system_faults import FAULTS
+from retwin.twins.commands.samplers import RampSampler
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.faults.system_faults import FAULTS
 
 SAMPLERS = (RampSampler,)
 """Kinds of command samplers that a bundle can describe; others remain code of the case."""

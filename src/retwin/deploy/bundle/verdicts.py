@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from retwin.arrays import floats
 from retwin.checks import agree, given, require
 from retwin.data.trajectories import UNKNOWN, Trajectories
-from retwin.twins.command_range import TOLERANCE, excess, extremes
+from retwin.twins.commands.range import TOLERANCE, excess, extremes
 from retwin.twins.twin import Twin
 
 T = TypeVar("T")

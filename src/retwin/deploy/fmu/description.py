@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from retwin._version import __version__
 from retwin.data.trajectories import Channels
-from retwin.twins.parametric import Parameter
+from retwin.twins.wrappers.parametric import Parameter
 
 EPOCH = datetime(1980, 1, 1, tzinfo=UTC)
 """The date in a file, which does not depend on when it was made."""

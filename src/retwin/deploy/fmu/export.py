@@ -20,7 +20,7 @@ from retwin.deploy.fmu.surrogates import surrogate_text
 from retwin.deploy.fmu.text import Text
 from retwin.errors import InputError, brief
 from retwin.serialisation.files import write_atomically
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names

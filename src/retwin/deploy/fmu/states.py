@@ -13,7 +13,7 @@ from retwin.checks import require
 from retwin.compiler import c_source
 from retwin.deploy.fmu.description import Variable, variables_of
 from retwin.deploy.fmu.text import Text, constants
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.twin import DynamicsTwin

@@ -35,7 +35,7 @@ from retwin.nets.networks import MLP, TCN
 from retwin.progress import Progress, tracked
 from retwin.serialisation.models import write_model
 from retwin.serialisation.places import check_place
-from retwin.twins.samplers import RampSampler
+from retwin.twins.commands.samplers import RampSampler
 from retwin.update.corrections import SampledSensor
 from retwin.update.residual import Mixture, ResidualModel
 from retwin.update.surrogate import Surrogate

@@ -26,7 +26,7 @@ from retwin.deploy.bundle.verdicts import (
 from retwin.deploy.onnx.session import Session, bounded_options
 from retwin.progress import Progress
 from retwin.times import sample_rate
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, checked_seed, simulate_in_chunks
 
 GRAPHS = ("surrogate", "residual", "correction", "guard")

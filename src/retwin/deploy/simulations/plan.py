@@ -22,13 +22,13 @@ from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError, place_of
 from retwin.progress import Progress
 from retwin.twins.collected import SimulationError
-from retwin.twins.command_range import part_of
-from retwin.twins.faults import Fault
+from retwin.twins.commands.range import part_of
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Twin, checked_commands
 
 if TYPE_CHECKING:  # a worker that simulates without torch need not load it
-    from retwin.twins.samplers import CommandSampler
+    from retwin.twins.commands.samplers import CommandSampler
 
 MAX_CHUNK = 2**31 - 1
 """Greatest number of trajectories in a chunk; the memory allows fewer of any length."""

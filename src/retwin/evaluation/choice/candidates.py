@@ -10,10 +10,10 @@ from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.evaluation.choice.settings import Choice
 from retwin.progress import Progress
-from retwin.twins.parametric import ParametricTwin
-from retwin.twins.record_sampler import moves_and_rests
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.commands.record_sampler import moves_and_rests
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import Twin
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive, Correction, DelayOffset
 from retwin.update.dynamics import DynamicsTwin, FittedDynamics, fit_dynamics, state_names

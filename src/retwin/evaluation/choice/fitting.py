@@ -27,8 +27,8 @@ from retwin.evaluation.choice.settings import MEMBERS, Choice
 from retwin.evaluation.choice.trials import Trials, shorter, unstable
 from retwin.progress import Progress
 from retwin.scores.distributions import crps_normal
-from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Twin, check_channels
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.agreement import check_with_twin
 from retwin.update.blackbox import BLACK_BOXES, fit_black_box
 from retwin.update.corrected import CorrectedTwin

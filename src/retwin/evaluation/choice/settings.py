@@ -8,7 +8,7 @@ from typing import Protocol
 
 from retwin.catalog import CANDIDATES
 from retwin.checks import one_of, positive, require
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.update.corrections import Correction
 from retwin.update.dynamics import Dynamics
 from retwin.update.residual import Density, Mixture, SequenceMixture

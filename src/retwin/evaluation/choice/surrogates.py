@@ -17,9 +17,9 @@ from retwin.nets.networks import LSTM, MLP, Network, StateSpace
 from retwin.nets.training import Training
 from retwin.progress import Progress
 from retwin.twins.collected import SimulationError
-from retwin.twins.command_range import CommandRange
-from retwin.twins.record_sampler import sampler_from
-from retwin.twins.samplers import CommandSampler, RecordedSampler
+from retwin.twins.commands.range import CommandRange
+from retwin.twins.commands.record_sampler import sampler_from
+from retwin.twins.commands.samplers import CommandSampler, RecordedSampler
 from retwin.twins.twin import Twin
 from retwin.update.corrected import generate
 from retwin.update.dynamics import state_names

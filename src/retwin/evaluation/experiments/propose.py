@@ -18,7 +18,7 @@ from retwin.evaluation.experiments.segments import SegmentKnowledge
 from retwin.inference.design import Knowledge, chosen
 from retwin.nets.student import widening
 from retwin.progress import Progress
-from retwin.twins.samplers import CommandSampler
+from retwin.twins.commands.samplers import CommandSampler
 from retwin.twins.twin import checked_seed
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import CommandSpace, before_sensor

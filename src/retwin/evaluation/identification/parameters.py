@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from retwin.twins.parametric import ParametricTwin
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.identification.identifiability import UNIFORM
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.posterior import Posterior

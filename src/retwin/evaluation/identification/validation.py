@@ -19,8 +19,8 @@ from retwin.evaluation.identification.parameters import (
 from retwin.evaluation.identification.residual_tests import ResidualTest, residual_tests
 from retwin.scores.intervals import MIN_GROUPS, jackknife_interval
 from retwin.scores.residuals import decorrelated_after
-from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import checked_stride
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.windows import simulated as simulated_outputs
 from retwin.update.identification.horizon import predictions
 from retwin.update.identification.identify import Updated

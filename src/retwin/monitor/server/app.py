@@ -18,17 +18,17 @@ from pydantic_core import to_jsonable_python
 from retwin._version import __version__
 from retwin.checks import at_most, needs_extra
 from retwin.errors import InputError
-from retwin.monitor.decision import Decision
-from retwin.monitor.explanations import Explanations
-from retwin.monitor.gate import Gate
-from retwin.monitor.live import Live
-from retwin.monitor.registry import Registry
-from retwin.monitor.samples import parse
+from retwin.monitor.live.explanations import Explanations
+from retwin.monitor.live.gate import Gate
+from retwin.monitor.live.live import Live
+from retwin.monitor.live.status import Received
 from retwin.monitor.server.comparison import Comparisons
 from retwin.monitor.server.guard import RequestGuard
 from retwin.monitor.server.metrics import Metrics
 from retwin.monitor.server.views import Views
-from retwin.monitor.status import Received
+from retwin.monitor.store.samples import parse
+from retwin.monitor.versions.decision import Decision
+from retwin.monitor.versions.registry import Registry
 from retwin.report.style import CHROME, PALETTE
 
 if TYPE_CHECKING:

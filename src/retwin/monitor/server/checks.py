@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from retwin.data.trajectories import HEALTHY
-from retwin.monitor.kinds import AnyMonitor
-from retwin.twins.system_faults import (
+from retwin.monitor.models.kinds import AnyMonitor
+from retwin.twins.faults.system_faults import (
     ActuatorGain,
     ParameterDrift,
     ParameterFault,

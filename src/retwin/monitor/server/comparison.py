@@ -8,9 +8,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from retwin.checks import at_most
-from retwin.monitor.comparison import compare
-from retwin.monitor.decision import Decision
-from retwin.monitor.store import Store
+from retwin.monitor.store.store import Store
+from retwin.monitor.versions.comparison import compare
+from retwin.monitor.versions.decision import Decision
 
 FRESH, PATIENCE, QUEUE = 60.0, 20.0, 16
 """A comparison is kept for so many seconds, or for so many times as long as it took, whichever is

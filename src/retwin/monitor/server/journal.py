@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from typing import Any
 
 from retwin.checks import given, require
-from retwin.monitor.audit import Entry
-from retwin.monitor.samples import SECOND
-from retwin.monitor.store import Store
+from retwin.monitor.store.audit import Entry
+from retwin.monitor.store.samples import SECOND
+from retwin.monitor.store.store import Store
 
 KEPT = 10_000
 """Newest alarms that are kept; all of them are in the log."""

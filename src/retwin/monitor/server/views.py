@@ -13,19 +13,19 @@ import numpy as np
 
 from retwin.checks import given, require
 from retwin.data.trajectories import Channels
-from retwin.monitor.cause import possible_causes
-from retwin.monitor.explanations import Explanations
-from retwin.monitor.gridded import gridded
-from retwin.monitor.kinds import AnyMonitor, load_monitor, pace
-from retwin.monitor.live import Live
-from retwin.monitor.machine import Recent
-from retwin.monitor.monitor import Monitor
-from retwin.monitor.registry import Registry
-from retwin.monitor.samples import SECOND
+from retwin.monitor.live.explanations import Explanations
+from retwin.monitor.live.live import Live
+from retwin.monitor.live.machine import Recent
+from retwin.monitor.live.status import AssetStatus
+from retwin.monitor.models.cause import possible_causes
+from retwin.monitor.models.kinds import AnyMonitor, load_monitor, pace
+from retwin.monitor.models.monitor import Monitor
+from retwin.monitor.models.trajectories import TrajectoryMonitor
 from retwin.monitor.server.checks import size_unit, what_to_check
 from retwin.monitor.server.journal import Journal
-from retwin.monitor.status import AssetStatus
-from retwin.monitor.trajectories import TrajectoryMonitor
+from retwin.monitor.store.gridded import gridded
+from retwin.monitor.store.samples import SECOND
+from retwin.monitor.versions.registry import Registry
 
 BAND = 1.645
 """Half the width of the 90 % band of a Gaussian, in its standard deviations."""

@@ -10,12 +10,12 @@ from itertools import takewhile
 from pathlib import Path
 
 from retwin.errors import InputError
-from retwin.monitor.gate import Gate
-from retwin.monitor.samples import Samples
+from retwin.monitor.live.gate import Gate
 from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.source import Source
 from retwin.monitor.sources.tables import GrowingTable, Layout
-from retwin.monitor.updates import EARLIEST
+from retwin.monitor.store.samples import Samples
+from retwin.monitor.store.updates import EARLIEST
 
 OVERLAP = 60 * 10**9
 """Nanoseconds before the newest stored sample from which rows are sent again after a restart: what

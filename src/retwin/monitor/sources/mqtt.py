@@ -13,10 +13,10 @@ from typing import Any
 
 from retwin.checks import needs_extra, one_of
 from retwin.errors import InputError, brief
-from retwin.monitor.gate import Gate
-from retwin.monitor.samples import Samples, Trajectory, parse
+from retwin.monitor.live.gate import Gate
 from retwin.monitor.settings import MqttSource, secret
 from retwin.monitor.sources.source import Source
+from retwin.monitor.store.samples import Samples, Trajectory, parse
 
 KEEPALIVE = 10
 """Seconds without a word from the broker after which it is asked whether it is there."""

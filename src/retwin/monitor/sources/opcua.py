@@ -12,11 +12,11 @@ from typing import Any
 from retwin.checks import needs_extra, require, same_names
 from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
-from retwin.monitor.gate import Gate
-from retwin.monitor.samples import Samples
+from retwin.monitor.live.gate import Gate
 from retwin.monitor.settings import OpcUaSource, secret
 from retwin.monitor.sources.assembly import Assembly
 from retwin.monitor.sources.source import AGAIN, Source
+from retwin.monitor.store.samples import Samples
 
 TIMEOUT = 4.0
 """Seconds in which the server must answer."""

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from concurrent.futures import Future
 
 from retwin.errors import InputError
-from retwin.monitor.gate import Gate
-from retwin.monitor.samples import Samples, Trajectory
+from retwin.monitor.live.gate import Gate
+from retwin.monitor.store.samples import Samples, Trajectory
 
 AGAIN = 2.0
 """Seconds after which what failed is tried again, so that a source is back within ten."""

@@ -15,13 +15,13 @@ from retwin.cases.case import Case
 from retwin.checks import require
 from retwin.data.io import load
 from retwin.errors import InputError
-from retwin.monitor.gate import Gate
-from retwin.monitor.samples import LONGEST, SECOND, Trajectory, places
+from retwin.monitor.live.gate import Gate
+from retwin.monitor.models.trajectories import TrajectoryMonitor
 from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.folder import Files
 from retwin.monitor.sources.layouts import layout_of
-from retwin.monitor.trajectories import TrajectoryMonitor
-from retwin.monitor.updates import EARLIEST
+from retwin.monitor.store.samples import LONGEST, SECOND, Trajectory, places
+from retwin.monitor.store.updates import EARLIEST
 from retwin.twins.twin import check_channels
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from retwin.compiler import call, compiled
 from retwin.twins.compiled.model import Model
-from retwin.twins.interpolation import cubic_coefficients, delayed
+from retwin.twins.equations.interpolation import cubic_coefficients, delayed
 
 
 @dataclass(frozen=True, eq=False)

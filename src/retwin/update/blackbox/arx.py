@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.blackbox.estimate import (
     BlackBox,
     BlackBoxFit,

@@ -17,10 +17,10 @@ from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.parametric import Parameter
-from retwin.twins.state import State
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state import State
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
+from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.estimation import Estimation, Point, correlation_time
 from retwin.update.dynamics.fitting import assembled

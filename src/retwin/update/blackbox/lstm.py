@@ -16,7 +16,7 @@ import torch
 from retwin.data.trajectories import Trajectories
 from retwin.nets.networks import MLP
 from retwin.progress import Progress
-from retwin.twins.command_range import CommandRange
+from retwin.twins.commands.range import CommandRange
 from retwin.update.blackbox.estimate import BlackBox, check_records
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.state import State
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state import State
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.blackbox.estimate import (
     BlackBox,
     BlackBoxFit,

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.interpolation import INTERPOLATIONS
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.interpolation import INTERPOLATIONS
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.dynamics.candidates import (
     Candidate,
     best_of,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.interpolation import delays_tried
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.interpolation import delays_tried
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.estimation import Estimation, correlation_time
 from retwin.update.dynamics.left_out import errors_without, held_out

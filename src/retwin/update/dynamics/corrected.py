@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from retwin.checks import one_of, require
 from retwin.twins.compiled.model import with_parameters
 from retwin.twins.compiled.program import Node
-from retwin.twins.parametric import Parameter
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.network import TanhNetwork

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from retwin.checks import one_of
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.dynamics.corrected import variable_names, variables_of
 from retwin.update.dynamics.domain import EXTRAPOLATED, Domain
 

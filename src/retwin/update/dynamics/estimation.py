@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.dynamics.arrow import Arrow, bounded_step, trust_region_step
 from retwin.update.dynamics.linearised import Linearised, Point
 from retwin.update.dynamics.unknowns import Unknowns

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
+from retwin.twins.equations.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.update.dynamics.domain import Domain
 
 STEP = 0.1

@@ -17,9 +17,9 @@ from retwin.data.measured import unmeasured
 from retwin.data.quality.check import doubtful
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.parametric import ParametricTwin
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.between_samples import chosen
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.domain import Domain

@@ -13,7 +13,7 @@ import torch
 
 from retwin.arrays import floats
 from retwin.checks import one_of, require, whole
-from retwin.twins.parametric import Parameter
+from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.dynamics.terms import Term, allowed
 
 __all__ = ["Library"]

@@ -20,9 +20,9 @@ import torch
 from numpy.typing import NDArray
 
 from retwin.twins.compiled.model import with_parameters
-from retwin.twins.parametric import Parameter
-from retwin.twins.state import State
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state import State
+from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.terms import WIDEST
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from retwin.checks import whole
-from retwin.twins.parametric import Parameter
+from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.terms import WIDEST, Term
 

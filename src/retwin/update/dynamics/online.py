@@ -15,7 +15,7 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.twins.interpolation import TAPS
+from retwin.twins.equations.interpolation import TAPS
 from retwin.update.dynamics.filtering import STEP
 from retwin.update.dynamics.prediction import Narrowing
 from retwin.update.dynamics.twin import DynamicsTwin

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from retwin.checks import one_of, require
 from retwin.serialisation.models import read_model, refusing, save_model
-from retwin.twins.saved_equations import equations_from, equations_of
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.saved_equations import equations_from, equations_of
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.dynamics.corrected import correctable
 from retwin.update.dynamics.domain import Domain
 from retwin.update.forecast_errors import ForecastErrors

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import distinct_rows
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state_twin import StateTwin
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from retwin.twins.parametric import Parameter
+from retwin.twins.wrappers.parametric import Parameter
 
 __all__ = ["WIDEST", "Term", "allowed"]
 

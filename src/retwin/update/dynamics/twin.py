@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
-from retwin.twins.faults import Fault
+from retwin.twins.equations.state_twin import SAMPLES_PER_CHUNK, StateTwin
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.limits import Limits
-from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
-from retwin.twins.wrapper import chunk_generator
+from retwin.twins.wrappers.wrapper import chunk_generator
 from retwin.update.dynamics.curves import Curve, axes_of, curve_of
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import Estimation, root

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from retwin.checks import require
-from retwin.twins.parametric import Parameter, ParametricTwin
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
 
 __all__ = ["Unknowns", "state_names", "state_twin_of", "unknowns_of"]
 

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.twins.parametric import ParametricTwin
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.estimation import Estimation
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of

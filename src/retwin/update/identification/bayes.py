@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.parametric import ParametricTwin
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.identification.mcmc import MCMC
 from retwin.update.identification.misfit import Misfit, misfit_of
 from retwin.update.identification.npe import NPE

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
-from retwin.twins.parametric import ParametricTwin
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.windows import sampled, state_based, windows_of
 
 FOLDS = 4

@@ -20,7 +20,7 @@ from retwin.data.quality.copies import find_copies
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.parametric import ParametricTwin
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.windows import state_based
 from retwin.update.identification.bayes import infer_posterior
 from retwin.update.identification.horizon import Candidate, choose_length, lasting

@@ -14,9 +14,9 @@ from retwin.checks import require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
-from retwin.twins.parametric import ParametricTwin
-from retwin.twins.step_error import StepWarning
+from retwin.twins.equations.step_error import StepWarning
 from retwin.twins.twin import checked_seed, checked_stride
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.windows import Windows, sampled, state_based, windows_of
 from retwin.workers.pools import sendable_errors, worker_pool
 

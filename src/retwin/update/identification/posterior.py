@@ -16,12 +16,12 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, save_model
-from retwin.twins.faults import Fault
-from retwin.twins.noisy import sensor_sample_count
-from retwin.twins.parametric import ParametricTwin
-from retwin.twins.randomised import simulate_with_parameters
+from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.twin import Chunk, simulate_in_chunks
-from retwin.twins.wrapper import TwinWrapper, chunk_generator
+from retwin.twins.wrappers.noisy import sensor_sample_count
+from retwin.twins.wrappers.parametric import ParametricTwin
+from retwin.twins.wrappers.randomised import simulate_with_parameters
+from retwin.twins.wrappers.wrapper import TwinWrapper, chunk_generator
 from retwin.update.identification.noise import Noise
 
 KIND = "posterior"

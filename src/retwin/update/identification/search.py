@@ -13,7 +13,7 @@ from scipy.stats.qmc import LatinHypercube
 
 from retwin.checks import one_of, require, whole
 from retwin.progress import Progress
-from retwin.twins.interpolation import delays_tried
+from retwin.twins.equations.interpolation import delays_tried
 from retwin.update.identification.misfit import Misfit
 
 DIFFERENCE = 1e-3

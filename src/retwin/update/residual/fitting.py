@@ -20,8 +20,8 @@ from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.nets.training import Fit, isolated
 from retwin.progress import Progress
-from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from
-from retwin.twins.faults import Fault
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_from
 from retwin.twins.twin import Twin
 from retwin.update.corrections import (
     Context,

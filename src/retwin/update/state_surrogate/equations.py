@@ -26,10 +26,10 @@ import torch
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Channels, Trajectories
+from retwin.twins.equations.state import State
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.limits import Limits
-from retwin.twins.parametric import Parameter
-from retwin.twins.state import State
-from retwin.twins.state_twin import StateTwin
+from retwin.twins.wrappers.parametric import Parameter
 
 PAST = 10
 """Least number of past samples from which the first estimate of the states is made."""

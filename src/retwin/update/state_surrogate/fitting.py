@@ -15,12 +15,12 @@ from retwin.checks import apart, finite, positive, require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, refusing, save_model
+from retwin.twins.commands.samplers import CommandSampler
+from retwin.twins.equations.saved_equations import equations_from, equations_of
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.limits import Limits
-from retwin.twins.parametric import Parameter
-from retwin.twins.samplers import CommandSampler
-from retwin.twins.saved_equations import equations_from, equations_of
-from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import Twin, checked_seed
+from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.state_surrogate.equations import ChannelScale
 from retwin.update.state_surrogate.search import Found, relative_error, searched
 from retwin.update.state_surrogate.simulations import (

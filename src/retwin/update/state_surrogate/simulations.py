@@ -14,10 +14,10 @@ from retwin.checks import agree, at_least, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
-from retwin.twins.parametric import Parameter, ParametricTwin
-from retwin.twins.record_sampler import sampler_from
-from retwin.twins.samplers import CommandSampler, RecordedSampler
+from retwin.twins.commands.record_sampler import sampler_from
+from retwin.twins.commands.samplers import CommandSampler, RecordedSampler
 from retwin.twins.twin import Twin, check_channels, checked_commands
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
 
 MIN_SAMPLES = 20
 """Least number of samples of a simulation: fewer show hardly any memory."""

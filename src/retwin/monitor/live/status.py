@@ -1,0 +1,88 @@
+"""What became of samples, and how machines are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from retwin.monitor.live.machine import Counts, Machine
+
+
+@dataclass(frozen=True)
+class Received:
+    """What became of samples or of a trajectory of one machine; see docs/monitor.md.
+
+    Attributes
+    ----------
+    asset : str
+        Its name.
+    counts : Counts
+        Samples by what was done with them; a trajectory counts once.
+    alarms : int
+        Events that began when they were used.
+
+    """
+
+    asset: str
+    counts: Counts
+    alarms: int
+
+
+@dataclass(frozen=True)
+class AssetStatus:
+    """How a machine is.
+
+    Attributes
+    ----------
+    asset, twin : str
+        Its name, and that of its twin.
+    version : int
+        The version of the twin that watches it.
+    time : int, optional
+        Time of its newest sample in nanoseconds; None before the first.
+    ratio : float
+        Evidence for a change, over the threshold of an alarm.
+    alarms : int
+        Events since the program was started.
+    last_alarm : int, optional
+        Time of the last one of these.
+    event, void, outside : bool
+        Whether an event lasts, whether the promise does not apply any more, and whether commands
+        have left their range in calibration.
+    rate : str
+        How the sample rate differs from the twin's; "" if it does not.
+    counts : dict of str to int
+        Samples since the program was started, by what was done with them.
+
+    """
+
+    asset: str
+    twin: str
+    version: int
+    time: int | None
+    ratio: float
+    alarms: int
+    last_alarm: int | None
+    event: bool
+    void: bool
+    outside: bool
+    rate: str
+    counts: dict[str, int]
+
+    @classmethod
+    def of(cls, machine: Machine[Any], arl: float) -> AssetStatus:
+        """The status of a machine whose alarms have that threshold."""
+        return cls(
+            machine.asset.name,
+            machine.asset.settings["twin"],
+            machine.asset.version or 0,
+            machine.newest,
+            machine.evidence / arl,
+            machine.alarms,
+            machine.last_alarm,
+            machine.event,
+            machine.void,
+            machine.outside,
+            machine.rate,
+            vars(machine.counts).copy(),
+        )

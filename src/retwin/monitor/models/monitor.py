@@ -1,0 +1,400 @@
+"""`Monitor`: watches running machines by their corrected twin, and raises alarms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from retwin.arrays import held
+from retwin.checks import require
+from retwin.data.trajectories import Trajectories
+from retwin.monitor.detect.detector import Detector
+from retwin.monitor.detect.disturbance import Disturbance, DisturbanceState
+from retwin.monitor.detect.events import CHANGED, FOLLOWS, Course, Rules
+from retwin.monitor.detect.noise import DECAYS, Noise, features, own_scale
+from retwin.monitor.detect.predictors import (
+    Predictor,
+    by_machine,
+    by_output,
+    by_stream,
+    finite_state,
+    implausible,
+    span_of,
+    standardised,
+)
+from retwin.monitor.detect.promise import Promise, Tried
+from retwin.monitor.detect.scores import ConformalScores, middle
+from retwin.monitor.detect.slack import Slack
+from retwin.monitor.detect.validity import Validity
+from retwin.monitor.models.monitor_state import MonitorState
+from retwin.monitor.models.parts import Part, Streams
+from retwin.monitor.models.saved import read_fields, write_fields
+from retwin.monitor.models.watched import Alarm, Ending, Watched
+from retwin.twins.twin import check_channels
+from retwin.update.dynamics.online import OnlineFilter
+from retwin.update.dynamics.twin import BEYOND, DynamicsTwin
+
+SIZE = 256
+"""Samples that are predicted at once: those after an alarm are predicted again. While an event
+lasts, where alarms are frequent, an eighth of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Monitor:
+    """A corrected twin that watches machines, with a promise of how rare false alarms are.
+
+    A Kalman filter predicts each sample from all earlier ones, an autoregression what its errors
+    have in common, and their ranks among those of the calibration are scores. An e-detector sums
+    the evidence for a change of these scores (`Detector`), and a test finds out whether the
+    promise applies (`Validity`). There are M such predictive models, whose filters follow the
+    machine at different speeds; their evidence is averaged with equal weights, which again is that
+    of an e-detector.
+
+    Attributes
+    ----------
+    twin : DynamicsTwin
+        The twin.
+    disturbance : Disturbance
+        Of M * d_y streams, the d_y outputs of the first model first.
+    scores : ConformalScores
+        The calibration errors of these streams.
+    slack : tuple of Slack
+        The classes of distributions of their scores.
+    resolution : NDArray
+        (d_y,), the steps to which the outputs are rounded; 0 for none.
+    arl : float
+        Average number of measured samples to a false alarm, at least.
+    noise : Noise
+        What the errors of the disturbance's predictions depend on.
+    tried : Tried
+        What happened on the records of the calibration, each left out in turn.
+    lasting : float
+        Time in s after which an event that has not ended is a change.
+    alpha : float
+        Probability of declaring a promise void that applies.
+    predictors : tuple of Predictor
+        The M predictive models.
+
+    """
+
+    twin: DynamicsTwin
+    disturbance: Disturbance
+    scores: ConformalScores
+    slack: tuple[Slack, ...]
+    resolution: NDArray
+    arl: float
+    noise: Noise
+    tried: Tried
+    lasting: float = 3600.0
+    alpha: float = 0.01
+    predictors: tuple[Predictor, ...] = (Predictor(),)
+
+    @property
+    def warm_up(self) -> float:
+        """Time in s after the first sample in which no evidence is counted: states are unknown."""
+        return min(each.warm_up for each in self.predictors)
+
+    @property
+    def promises(self) -> dict[str, Promise]:
+        """What is promised of each output."""
+        outputs = self.twin.outputs.names
+        return {
+            name: Promise(
+                self.run_length,
+                self.twin.rate,
+                self.slack[i],
+                self.alpha,
+                self.slack[i + len(outputs) :: len(outputs)],
+            )
+            for i, name in enumerate(outputs)
+        }
+
+    @property
+    def run_length(self) -> float:
+        """The average run length that is promised: the one that is wanted, if it held there."""
+        return self.arl if self.tried.kept(self.arl) else min(self.arl, self.tried.run_length)
+
+    def start(self, count: int) -> MonitorState:
+        """What is known of so many machines before their first sample."""
+        streams = self._streams(count)
+        return MonitorState(
+            tuple(each.start(count) for each in self._filters),
+            streams.disturbance.start(),
+            streams.detector.start(count * len(self.slack)),
+            streams.validity.start(count * len(self.slack)),
+            Course.start(count),
+            np.zeros((count, len(DECAYS), len(self.twin.inputs))),
+            np.zeros((count * len(self.slack), 2)),
+            np.zeros(count, dtype=bool),
+        )
+
+    def step(
+        self, state: MonitorState, commands: ArrayLike, measured: ArrayLike, ids: ArrayLike = ()
+    ) -> tuple[MonitorState, Watched]:
+        """Watch T more samples of n machines. However samples are cut, results are the same bytes.
+
+        Where the filter does not stay finite, it begins anew after these samples, and the promise
+        does not apply to that machine any more.
+
+        Parameters
+        ----------
+        state : MonitorState
+            After the samples before. It is not changed.
+        commands : array_like, shape (n, T, d_u)
+            A command that is not finite, or is 100 times its range in calibration away from that,
+            is the one before it; the first must be finite.
+        measured : array_like, shape (n, T, d_y)
+            Outputs; those that are not finite are missing.
+        ids : sequence of str, optional
+            Names of the machines.
+
+        """
+        commands, measured = (np.asarray(each, dtype=float) for each in (commands, measured))
+        count, samples = measured.shape[:2]
+        require(
+            commands.shape == (count, samples, len(self.twin.inputs))
+            and measured.shape == (count, samples, len(self.twin.outputs))
+            and count == len(state.void)
+            and samples > 0,
+            "measured",
+            expected=f"one or more samples of {len(state.void)} machines with "
+            f"{len(self.twin.inputs)} commands and {len(self.twin.outputs)} outputs",
+            got=f"shapes {commands.shape} and {measured.shape}",
+            remedy="give arrays (machines, samples, channels)",
+        )
+        known = self._held(state, commands)
+        names = list(np.asarray(ids, dtype=str)) or [""] * count
+        alarms, endings, parts, first = list[Alarm](), list[Ending](), [], 0
+        while first < samples:
+            calm = (state.course.event < 0).all()
+            size = min(SIZE if calm else SIZE // 8, samples - first)
+            own = [each[:, first : first + size] for each in (known, measured)]
+            part = self._part(state, *own)
+            if (until := part.until) < size:  # the machine begins anew after the first alarm
+                part = self._part(state, *(each[:, :until] for each in own))
+            state, shown = self._after(state, part, names, alarms, endings)
+            parts.append(shown)
+            first += part.until
+        shown = tuple(np.concatenate(each, axis=1) for each in zip(*parts, strict=True))
+        mean, deviation, score, evidence, alarm, event, void = shown
+        far = implausible(self.twin, commands).any(axis=2)
+        outside = np.asarray((self._outside(known) | far).any(axis=1))
+        flags = alarm, event, void, outside
+        return state, Watched(mean, deviation, score, evidence, *flags, alarms, endings)
+
+    def watch(self, record: Trajectories) -> Watched:
+        """Watch recorded trajectories, each as a machine of its own.
+
+        Raises
+        ------
+        InputError
+            Other channels or another rate than those of the twin.
+
+        """
+        check_channels(self.twin, record, "record")
+        measured = np.where(record.mask, record.observed, np.nan)
+        return self.step(self.start(len(record)), record.commands, measured, record.ids)[1]
+
+    @property
+    def rules(self) -> Rules:
+        """When events begin and end."""
+        return Rules.of(self.arl, max(1, round(self.lasting * self.twin.rate)))
+
+    def _part(self, state: MonitorState, commands: NDArray, measured: NDArray) -> Part:
+        """What is found in samples (n, T, ...) if none of the machines begins anew in them."""
+        count, samples = measured.shape[:2]
+        seen, learn = np.isfinite(measured), state.course.event < 0
+        predicted = [
+            online.step(own, commands, measured, seen, learn)
+            for online, own in zip(self._filters, state.filters, strict=True)
+        ]
+        pairs = zip(
+            *(
+                standardised(measured - mean, covariance, seen, self.resolution)
+                for _, mean, covariance in predicted
+            ),
+            strict=True,
+        )
+        error, width = (by_stream(np.concatenate(each, axis=2)) for each in pairs)
+        streams = self._streams(count)
+        disturbance, error, scale = streams.disturbance.run(state.disturbance, error)
+        _, mean, covariance = predicted[0]
+        before, level = state.filters[0].commands[:, -1], np.nan_to_num(mean)
+        changes, noted = features(state.changes, before, commands, level, span_of(self.twin))
+        shift, spread = (by_stream(each) for each in self.noise.run(noted))
+        error, width = (error - shift) / spread, width / scale / spread
+        calm = np.repeat(learn, len(self.slack))
+        own, sums = own_scale(state.scale, error, np.tile(self.noise.degrees, count))
+        sums = np.where(calm[:, None], sums, state.scale)
+        own = np.where(calm[:, None], own, own[:, :1])
+        error, width = error / own, width / own
+        low, high = self.scores.score(by_output(error, count), by_output(width, count))
+        low, high = (by_stream(by_machine(each, count)) for each in (low, high))
+        since, rate = state.course.samples - state.course.begun, self.twin.rate
+        used = np.stack([each.used(since, samples, rate) for each in self.predictors], axis=1)
+        used = np.repeat(used, len(self.twin.outputs), axis=1).reshape(low.shape)
+        low, high = (np.where(used, each, np.nan) for each in (low, high))
+        detector, evidence = streams.detector.run(state.detector, low, high)
+        total = evidence.reshape(count, len(self.slack), -1).mean(axis=1)
+        counted = np.isfinite(low).reshape(count, len(self.slack), -1).any(axis=1)
+        rules = self.rules
+        alarm = rules.alarms(total)
+        ended = rules.ends(state.course, total, counted) & ~alarm
+        outside = self._outside(commands)
+        changed = rules.changes(state.course, samples) & ~ended
+        filters = tuple(
+            finite_state(online, filtered)
+            for online, (filtered, _, _) in zip(self._filters, predicted, strict=True)
+        )
+        stays_finite = np.all(
+            [np.isfinite(each).all(axis=(1, 2)) for _, each, _ in predicted], axis=0
+        )
+        after = replace(
+            state,
+            filters=filters,
+            disturbance=disturbance,
+            detector=detector,
+            changes=changes,
+            scale=sums,
+            void=state.void | ~stays_finite,
+        )
+        deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
+        flags = alarm, ended, changed, counted, outside
+        return Part(after, mean, deviation, low, high, evidence, total, *flags)
+
+    def _after(
+        self,
+        state: MonitorState,
+        part: Part,
+        names: list[str],
+        alarms: list[Alarm],
+        endings: list[Ending],
+    ) -> tuple[MonitorState, tuple[NDArray, ...]]:
+        """The state after a part whose last sample may have alarms or ends of events."""
+        each, course, after = len(self.slack), state.course, part.after
+        alarm, ended, changed = (own[:, -1] for own in (part.alarm, part.ended, part.changed))
+        opens = alarm & (course.event < 0)
+        # Only outside of events, and in the range of the calibration, is something promised.
+        calm = np.repeat((course.event < 0)[:, None] & ~part.outside, each, axis=0)
+        low, high = (np.where(calm, own, np.nan) for own in (part.low, part.high))
+        flags = np.zeros(low.shape, dtype=bool)
+        flags[:, -1] = np.repeat(opens & ~part.outside[:, -1], each)
+        streams = self._streams(len(alarm))
+        validity, against = streams.validity.run(state.validity, flags, low, high)
+        broken = against.reshape(len(alarm), each, -1).mean(axis=1) >= 1 / self.alpha
+        void = np.logical_or.accumulate(broken, axis=1) | after.void[:, None]
+        lasts = np.repeat((course.event >= 0)[:, None], void.shape[1], axis=1)
+        lasts[opens, -1] = True
+        course = self.rules.after(course, part.counted, alarm, ended, changed)
+        for machine in np.flatnonzero(alarm):
+            rows = slice(machine * each, (machine + 1) * each)
+            stream = int(np.argmax(part.evidence[rows, -1]))
+            weighed = after.detector.evidence[rows][stream] * streams.detector.bets.weights
+            sample = int(course.samples[machine]) - 1
+            outputs = self.twin.outputs.names
+            alarms.append(
+                Alarm(
+                    names[machine],
+                    sample,
+                    sample / self.twin.rate,
+                    outputs[stream % len(outputs)],
+                    streams.detector.change(int(np.argmax(weighed))),
+                    float(part.total[machine, -1]),
+                    sample if opens[machine] else int(state.course.event[machine]),
+                    not (void[machine, -1] or part.outside[machine, -1]),
+                    tuple(after.filters[0].centre[machine].tolist()),
+                )
+            )
+        for machine in np.flatnonzero(ended | changed):
+            how = FOLLOWS if ended[machine] else CHANGED
+            event, sample = int(state.course.event[machine]), int(course.samples[machine]) - 1
+            endings.append(Ending(names[machine], event, sample, how))
+        after = replace(after, validity=validity, course=course, void=void[:, -1])
+        count = len(self.twin.outputs)
+        score = middle(part.low, part.high).reshape(len(alarm), each, -1)[:, :count]
+        shown = part.mean, part.deviation, np.moveaxis(score, 1, 2), part.total, part.alarm
+        return self._anew(after, alarm | changed, ended, changed), (*shown, lasts, void)
+
+    def _anew(
+        self, state: MonitorState, anew: NDArray, ended: NDArray, changed: NDArray
+    ) -> MonitorState:
+        """The state where filter and detector begin anew; after a change with another machine."""
+        streams, each = self._streams(len(anew)), len(self.slack)
+        detector = streams.detector.reset(state.detector, np.repeat(anew | ended, each))
+        if not anew.any():
+            return replace(state, detector=detector)
+        rows, first = np.flatnonzero(anew), streams.disturbance.start()
+        filters = []
+        for online, own in zip(self._filters, state.filters, strict=True):
+            new, old = online.start(len(rows)), own.of(rows)
+            kept = {name: getattr(old, name) for name in ("commands", "simulated")}
+            learned = ~changed[rows]
+            for name in ("centre", "root"):
+                values = getattr(new, name)
+                values[learned] = getattr(old, name)[learned]
+                kept[name] = values
+            filters.append(own.merged(rows, replace(new, **kept)))
+        where = np.repeat(anew, each)
+        scale = np.where(np.repeat(changed, each)[:, None], 0.0, state.scale)
+        disturbance = DisturbanceState(
+            np.where(where[:, None], first.mean, state.disturbance.mean),
+            np.where(where[:, None, None], first.covariance, state.disturbance.covariance),
+        )
+        return replace(
+            state,
+            filters=tuple(filters),
+            disturbance=disturbance,
+            detector=detector,
+            scale=scale,
+        )
+
+    def _held(self, state: MonitorState, commands: NDArray) -> NDArray:
+        """Commands (n, T, d_u), where those that are missing or implausible are as before."""
+        given = np.concatenate([state.filters[0].commands[:, -1:], commands], axis=1)
+        known = held(np.where(implausible(self.twin, given), np.nan, given), 1)
+        # Without a plausible one before, an implausible one is all that is known.
+        known = np.where(np.isfinite(known), known, held(given, 1))[:, 1:]
+        require(
+            np.isfinite(known).all(),
+            "commands",
+            expected="finite commands at the first sample of each machine",
+            got="others",
+            remedy="begin at the first sample whose commands are known",
+        )
+        return known
+
+    def _outside(self, commands: NDArray) -> NDArray:
+        """Whether commands (n, T, d_u) leave their range in both calibrations, (n, T)."""
+        low, high = (each[len(self.twin.process) :] for each in self.twin.bounds)
+        least, largest = (each[: len(low)] for each in (self.noise.low, self.noise.high))
+        margin = BEYOND * (largest - least)
+        low, high = np.minimum(low, least - margin), np.maximum(high, largest + margin)
+        return np.asarray(((commands < low) | (commands > high)).any(axis=2))
+
+    @cached_property
+    def _filters(self) -> tuple[OnlineFilter, ...]:
+        return tuple(each.filter(self.twin) for each in self.predictors)
+
+    @cached_property
+    def _by_count(self) -> dict[int, Streams]:
+        """The parts for each number of machines that was used: their tables take long to make."""
+        return {}
+
+    def _streams(self, count: int) -> Streams:
+        if count not in self._by_count:
+            validity = Validity(Detector(self.slack), self.run_length, self.alpha)
+            self._by_count[count] = Streams.of(self.disturbance, validity, count)
+        return self._by_count[count]
+
+    def save(self, folder: str | Path) -> None:
+        """Write the twin, the calibration and the promise."""
+        write_fields(folder, vars(self))
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Monitor:
+        """Read what `save` wrote. Raises InputError if it is no monitor or is damaged."""
+        return cls(**read_fields(folder))

@@ -1,0 +1,94 @@
+"""Monitors on the disk."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from retwin.checks import finite, require
+from retwin.monitor.detect.disturbance import Disturbance
+from retwin.monitor.detect.noise import Noise
+from retwin.monitor.detect.predictors import Predictor
+from retwin.monitor.detect.promise import Tried
+from retwin.monitor.detect.scores import ConformalScores
+from retwin.monitor.detect.slack import Slack
+from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.update.dynamics.twin import DynamicsTwin
+
+KIND = "monitor"
+"""Kind of the saved model."""
+NUMBERS = ("arl", "lasting", "alpha")
+"""Attributes of a monitor that are saved as numbers."""
+DISTURBANCE = ("coefficients", "mean", "process", "measurement")
+"""Attributes of the disturbance that are saved as arrays."""
+NOISE = ("low", "high", "mean", "scale", "degrees")
+"""The same of the noise."""
+
+
+def write_fields(folder: str | Path, fields: Mapping[str, Any]) -> None:
+    """Write the attributes of a monitor."""
+    scores, predictors, slack = (fields[name] for name in ("scores", "predictors", "slack"))
+    about = {
+        "slack": [[each.kappa, each.shift] for each in slack],
+        "copies": scores.copies,
+        "predictors": [[each.process, each.warm_up, each.effect] for each in predictors],
+        "tried": vars(fields["tried"]),
+        **{name: fields[name] for name in NUMBERS},
+    }
+    arrays = {name: getattr(fields["disturbance"], name) for name in DISTURBANCE}
+    arrays |= {f"noise.{name}": getattr(fields["noise"], name) for name in NOISE}
+    arrays |= scores.arrays() | {"resolution": fields["resolution"]}
+    tensors = {name: torch.tensor(np.ascontiguousarray(each)) for name, each in arrays.items()}
+    with write_model(folder, KIND, about, tensors) as temporary:
+        fields["twin"].save(temporary / "twin")
+
+
+def read_fields(folder: str | Path) -> dict[str, Any]:
+    """The attributes of a monitor; InputError if the folder holds none or is damaged."""
+    about, weights = read_model(folder, KIND)
+    with refusing(folder, expected="a monitor"):
+        arrays = {name: each.numpy() for name, each in weights.items()}
+        nothing = np.zeros((len(arrays["mean"]), 0))
+        own = {name: arrays[name] for name in DISTURBANCE}
+        disturbance = Disturbance(**own, held_out=nothing, deviation=nothing)
+        noise = Noise(**{name: arrays[f"noise.{name}"] for name in NOISE})
+        scores = ConformalScores.of_arrays(arrays, about["copies"])
+        slack = tuple(Slack(*each) for each in about["slack"])
+        twin = DynamicsTwin.load(Path(folder) / "twin")
+        predictors = tuple(Predictor(*each) for each in about["predictors"])
+        streams = len(predictors) * len(twin.outputs)
+        parts = (
+            disturbance.mean,
+            scores.independent,
+            slack,
+            noise.mean,
+            noise.scale,
+            noise.degrees,
+        )
+        shapes = [len(each) for each in (*parts, arrays["resolution"])]
+        values = (disturbance.coefficients, noise.mean, noise.scale, noise.low, noise.high)
+        require(
+            shapes == [streams] * 6 + [len(twin.outputs)]
+            and all(np.isfinite(each).all() for each in values)
+            and (disturbance.process > 0).all()
+            and (disturbance.measurement >= 0).all(),
+            "weights",
+            expected=f"the calibration of {len(twin.outputs)} outputs",
+            got=shapes,
+            remedy="save the monitor again",
+        )
+        return {
+            "twin": twin,
+            "disturbance": disturbance,
+            "scores": scores,
+            "slack": slack,
+            "resolution": arrays["resolution"],
+            "noise": noise,
+            "tried": Tried(**about["tried"]),
+            "predictors": predictors,
+            **{name: finite(name, about[name], least=0.0) for name in NUMBERS},
+        }

@@ -1,0 +1,131 @@
+"""`fit_trajectory_monitor`: calibrates a monitor on trajectories of the healthy machine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from retwin.checks import finite, instance, require
+from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.errors import InputError
+from retwin.monitor.detect.offsets import biases, fit_offsets
+from retwin.monitor.detect.promise import false_alarms
+from retwin.monitor.detect.scores import fit_scores
+from retwin.monitor.models.trajectories import TrajectoryMonitor
+from retwin.monitor.models.trajectory_evidence import (
+    Inversion,
+    alternatives,
+    checked,
+    compared,
+    factors,
+)
+from retwin.progress import Progress
+from retwin.twins.faults.actuator_faults import Fault
+
+MIN_TRAJECTORIES = 8
+"""Healthy trajectories of a calibration, at least."""
+FACTORS = np.arange(1.0, 10.005, 0.01)
+"""Factors of the errors of which the smallest is taken with which the calibration agrees."""
+CERTAIN = 1.645
+"""Standard errors up to which the calibration may disagree: 95 %, one-sided."""
+
+
+def fit_trajectory_monitor(
+    diagnoser: Inversion,
+    healthy: Trajectories,
+    false_alarms_at_most: str | float = "1 per month",
+    *,
+    causes: Mapping[str, Fault] | None = None,
+    alpha: float = 0.01,
+    progress: Progress | None = None,
+) -> TrajectoryMonitor:
+    """Calibrate a monitor on trajectories of the healthy machine.
+
+    Parameters
+    ----------
+    diagnoser : InversionDiagnoser or StateInversionDiagnoser
+        Of `fit_inversion`, with the faults.
+    healthy : Trajectories
+        Healthy trajectories, at least 8, best of several days, that the twin was not fitted to.
+    false_alarms_at_most : str or float
+        See `false_alarms`; "1 per month" is one of a machine that works without pause, and
+        "1000 trajectories" or a number is the average run length itself.
+    causes : mapping of str to Fault, optional
+        Further faults to watch for, beside those of the diagnoser, such as `Case.causes`.
+    alpha : float
+        Probability of declaring the promise void although it applies.
+    progress : callable, optional
+        Called with the finished share.
+
+    Returns
+    -------
+    TrajectoryMonitor
+        With its promise.
+
+    Raises
+    ------
+    InputError
+        Too few trajectories, other channels or another rate than those of the twin, no diagnoser
+        by inversion, or trajectories that look faulty to it.
+
+    """
+    diagnoser = checked(checked(diagnoser).with_faults(causes or {}))
+    instance("healthy", healthy, Trajectories, remedy="load recorded ones")
+    finite("alpha", alpha, least=1e-12, most=0.5)
+    _check_labels(diagnoser, healthy)
+    length = healthy.steps / healthy.rate
+    arl = false_alarms(false_alarms_at_most, 1 / length)
+    found = compared(diagnoser, healthy, progress)
+    used = np.isfinite(found.error) & ~found.outside
+    require(
+        used.sum() >= MIN_TRAJECTORIES,
+        "healthy",
+        expected=f"at least {MIN_TRAJECTORIES} trajectories",
+        got=f"{len(healthy)}, of which {int(found.unmeasured.sum())} without measured samples, "
+        f"{int(found.implausible.sum())} with implausible readings and "
+        f"{int(found.outside.sum())} with commands outside their range in training",
+        remedy="record more healthy trajectories, with commands as those of the twin's training",
+    )
+    ratio, count = found.ratio[used], found.measured[used]
+    scores = fit_scores(found.error[None, used])
+    (slack,) = scores.slack(1)
+    some = bool(biases(diagnoser.faults.values()))
+    offsets = fit_offsets(found.offset[used]) if some else None
+    for kappa in FACTORS[slack.kappa <= FACTORS]:
+        factor = factors(ratio, kappa).mean(axis=1)
+        bound = factor.mean() + CERTAIN * factor.std(ddof=1) / np.sqrt(len(factor))
+        if bound <= 1:
+            return TrajectoryMonitor(
+                diagnoser,
+                scores,
+                slack,
+                float(kappa),
+                arl,
+                length,
+                np.stack([count.min(axis=0), count.max(axis=0)]).astype(float),
+                offsets,
+                float(alpha),
+                int(used.sum()),
+                len(healthy),
+            )
+    likely = alternatives(diagnoser)[int(np.median(ratio, axis=0).argmax())]
+    raise InputError(
+        "healthy",
+        expected="trajectories that the diagnoser takes for healthy ones",
+        got=f"some that look like {likely}",
+        remedy="leave out faulty ones, or calibrate the twin on more healthy trajectories",
+    )
+
+
+def _check_labels(diagnoser: Inversion, healthy: Trajectories) -> None:
+    """Refuse trajectories that are labelled as faulty ones."""
+    allowed = {HEALTHY, *(name for name, fault in diagnoser.faults.items() if fault is None)}
+    faulty = sorted(healthy.known_labels - allowed)
+    require(
+        not faulty,
+        "healthy",
+        expected=f"trajectories without labels, or labelled {' or '.join(sorted(allowed))}",
+        got=f"some labelled {', '.join(faulty[:3])}",
+        remedy="leave these out",
+    )

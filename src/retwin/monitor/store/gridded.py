@@ -1,0 +1,77 @@
+"""Samples of a machine at the sample rate of its twin, and as a record."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.arrays import held
+from retwin.data.trajectories import Trajectories
+from retwin.monitor.store.samples import SECOND, places
+from retwin.monitor.store.store import Store
+from retwin.monitor.store.updates import EARLIEST
+from retwin.update.dynamics.twin import DynamicsTwin
+
+
+def gridded(
+    store: Store, asset: str, twin: DynamicsTwin, first: int, last: int
+) -> tuple[NDArray, NDArray]:
+    """Times (T,) and values (T, d_u + d_y) of stored samples, at the sample rate of the twin.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    asset : str
+        Name of the machine.
+    twin : DynamicsTwin
+        Its twin.
+    first, last : int
+        Times in nanoseconds between which samples are read.
+
+    Returns
+    -------
+    NDArray, NDArray
+        From the first sample with all commands on; NaN where there is no sample. A command that is
+        missing later is the one before.
+
+    """
+    commands = len(twin.inputs)
+    times, values = [np.zeros(0, dtype=np.int64)], [np.zeros((0, commands + len(twin.outputs)))]
+    for part, rows in store.samples(asset, max(EARLIEST, first - 1)):
+        times.append(part[part <= last])
+        values.append(rows[part <= last])
+        if part[-1] > last:
+            break
+    found, given = np.concatenate(times), np.concatenate(values)
+    begun = np.logical_or.accumulate(np.isfinite(given[:, :commands]).all(axis=1))
+    found, given = found[begun], given[begun]
+    if not len(found):
+        return found, given
+    period = SECOND / twin.rate
+    place, chosen = places(found, found[0], twin.rate)
+    inside = place <= (last - first) / period
+    rows = np.full((int(place[inside][-1]) + 1, given.shape[1]), np.nan)
+    rows[place[inside]] = given[chosen[inside]]
+    rows[:, :commands] = held(rows[:, :commands], 0)
+    return found[0] + np.round(np.arange(len(rows)) * period).astype(np.int64), rows
+
+
+def record_of(twin: Any, values: NDArray) -> Trajectories:
+    """Samples (T, d_u + d_y) at the sample rate of a twin as one trajectory.
+
+    A command that is missing is the one before; the first ones must be there.
+    """
+    commands, measured = np.split(values, [len(twin.inputs)], axis=1)
+    return Trajectories(
+        commands=held(commands, 0)[None],
+        nominal=np.zeros_like(measured)[None],
+        observed=np.where(np.isfinite(measured), measured, 0.0)[None],
+        mask=np.isfinite(measured)[None],
+        rate=twin.rate,
+        ids=np.array([""]),
+        inputs=twin.inputs,
+        outputs=twin.outputs,
+    )

@@ -1,0 +1,251 @@
+"""`Samples` and whole trajectories of a machine, and the JSON in which they are sent."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import at_most, require
+from retwin.data.logs.signals import nanoseconds
+from retwin.errors import InputError, brief
+from retwin.monitor.store.updates import EARLIEST, LATEST
+
+SECOND = 10**9
+"""Nanoseconds of a second."""
+LONGEST = 100_000
+"""Samples of a document at most."""
+KEYS = {"asset", "time", "time_ns", "values"}
+REMEDY = 'send {"asset": "line1", "time": 1700000000.0, "values": {"T1": 21.3}}'
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples of one machine.
+
+    Parameters
+    ----------
+    asset : str
+        Its name.
+    times : array (n,) of int64
+        Nanoseconds since the epoch, in the order of arrival.
+    values : array (n, d_u + d_y)
+        Commands, then outputs; what is not finite is missing.
+
+    Raises
+    ------
+    InputError
+        Arrays of other shapes or types.
+
+    """
+
+    asset: str
+    times: NDArray
+    values: NDArray
+
+    def __post_init__(self) -> None:
+        times, values = np.asarray(self.times), np.asarray(self.values, dtype=float)
+        require(
+            times.dtype.kind == "i"
+            and times.ndim == 1
+            and values.shape[:1] == times.shape
+            and values.ndim == 2,
+            f"samples of {self.asset}",
+            expected="whole times (n,) in nanoseconds and values (n, channels)",
+            got=f"{times.dtype} {times.shape} and {values.shape}",
+            remedy="give one row of values for each time",
+        )
+        object.__setattr__(self, "times", times.astype(np.int64))
+        object.__setattr__(self, "values", np.where(np.isfinite(values), values, np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A complete trajectory of one machine, at the sample rate of its twin.
+
+    Parameters
+    ----------
+    asset : str
+        Its name.
+    begin : int
+        Time of the first sample, in nanoseconds since the epoch.
+    values : array (T, d_u + d_y)
+        Commands, then outputs; what is not finite is missing.
+
+    """
+
+    asset: str
+    begin: int
+    values: NDArray
+
+    def samples(self, rate: float) -> Samples:
+        """Its samples at that rate in Hz; times end before they are out of range."""
+        period = SECOND / rate
+        times = [min(self.begin + round(k * period), LATEST) for k in range(len(self.values))]
+        return Samples(self.asset, np.array(times, dtype=np.int64), self.values)
+
+
+def places(times: NDArray, begin: int, rate: float) -> tuple[NDArray, NDArray]:
+    """Places from `begin` on at a rate in Hz that times (n,) in ns are nearest to, each once in
+    order, and the first time of each.
+    """
+    place = np.round((times - begin) * (rate / SECOND)).astype(np.int64)
+    return np.unique(place, return_index=True)
+
+
+def parse(
+    document: bytes | str, channels: Callable[[str], Sequence[str]], asset: str | None = None
+) -> list[Samples | Trajectory]:
+    """The samples of a JSON document, of one machine after the other, and then its trajectories.
+
+    Parameters
+    ----------
+    document : bytes or str
+        An object `{"asset": "line1", "time": 1700000000.25, "values": {"heater": 1, "T1": 21.3}}`,
+        an array of such objects, or one on each line. `time` is in s since the epoch or ISO 8601
+        with an offset; `time_ns` in its place is a whole number of nanoseconds. A channel that is
+        absent, null or not finite is missing. Where `values` are arrays, the object is a
+        trajectory, `time` is that of its first sample, and the others follow at the sample rate of
+        the twin.
+    channels : callable
+        Gives the names of the channels of a machine, commands first; it raises an InputError for an
+        unknown one (`Live.channels`).
+    asset : str, optional
+        The one machine that the document is about; its objects need not name it.
+
+    Raises
+    ------
+    InputError
+        No such document, more than 100 000 samples, or an unknown machine or channel.
+
+    """
+    times: dict[str, list[int]] = {}
+    rows: dict[str, list[list[float]]] = {}
+    known: dict[str, dict[str, int]] = {}
+    trajectories: list[Samples | Trajectory] = []
+    count = 0
+    needed = {"values"} if asset is not None else {"asset", "values"}
+    for number, each in enumerate(_objects(document)):
+        place = f"sample {number}"
+        given = each.get("values") if isinstance(each, dict) else None
+        given = given if isinstance(given, dict) else {}
+        length = max(map(_length, given.values()), default=0)
+        count += max(1, length)
+        at_most("samples", count, LONGEST, "in a document", remedy="send them in parts")
+        require(
+            isinstance(each, dict) and needed <= each.keys() <= KEYS,
+            place,
+            expected=f"an object with {', '.join(sorted(needed))} and time",
+            got=f"{type(each).__name__} {repr(each)[:60]}",
+            remedy=REMEDY,
+        )
+        name = each.get("asset", asset)
+        if not isinstance(name, str) or asset not in (None, name):
+            raise _refused(f"{place}: asset", name, "its name" if asset is None else repr(asset))
+        if name not in known:
+            known[name] = {channel: i for i, channel in enumerate(channels(name))}
+        if length:
+            columns = _columns(given, length, place)
+            block = [_row(row, known[name], place) for row in columns]
+            trajectories.append(Trajectory(name, _time(each, place), np.array(block)))
+            continue
+        times.setdefault(name, []).append(_time(each, place))
+        rows.setdefault(name, []).append(_row(each["values"], known[name], place))
+    return [
+        *(Samples(name, np.array(times[name], np.int64), np.array(rows[name])) for name in times),
+        *trajectories,
+    ]
+
+
+def _objects(document: bytes | str) -> Iterator[Any]:
+    """The objects of a document: one, those of an array, or one of each line."""
+    try:
+        text = document if isinstance(document, str) else document.decode("utf-8")
+        lines = [each for each in text.split("\n") if each.strip()]
+        try:
+            whole = json.loads(text)
+        except json.JSONDecodeError:
+            if len(lines) < 2:
+                raise
+            for each in lines:
+                yield json.loads(each)
+        else:
+            yield from whole if isinstance(whole, list) else [whole]
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            "samples",
+            expected="a JSON object, an array of them, or one on each line",
+            got=f"{type(error).__name__}: {brief(error)}",
+            remedy=REMEDY,
+        ) from None
+
+
+def _refused(place: str, given: object, expected: str, remedy: str = REMEDY) -> InputError:
+    """The error about a part of a document."""
+    return InputError(place, expected=expected, got=repr(given)[:60], remedy=remedy)
+
+
+def _time(each: dict[str, Any], place: str) -> int:
+    """The time of a sample in nanoseconds."""
+    given = each.get("time_ns", each.get("time"))
+    made: int | None = None
+    if len({"time", "time_ns"} & each.keys()) == 1:
+        if isinstance(given, str) and "time" in each:
+            try:
+                moment = datetime.fromisoformat(given)
+                made = nanoseconds(moment) if moment.tzinfo else None
+            except ValueError:
+                made = None
+        elif isinstance(given, int) and not isinstance(given, bool):
+            made = given if "time_ns" in each else given * SECOND
+        elif isinstance(given, float) and "time" in each and abs(given) < LATEST:
+            made = round(given * SECOND)
+    if made is not None and EARLIEST < made < LATEST:
+        return made
+    expected = "seconds since the epoch, ISO 8601 with an offset, or whole time_ns"
+    raise _refused(f"{place}: time", given, expected)
+
+
+def _length(value: Any) -> int:
+    """Of an array; 0 for a number."""
+    return len(value) if isinstance(value, list) else 0
+
+
+def _columns(values: dict[str, Any], length: int, place: str) -> Iterator[dict[str, Any]]:
+    """The values of each sample of a trajectory, whose channels are arrays of one length."""
+    for name, value in values.items():
+        if _length(value) != length:
+            raise InputError(
+                f"{place}: {repr(name)[:60]}",
+                expected=f"an array of {length} numbers, as another channel has",
+                got=f"{_length(value)}" if isinstance(value, list) else repr(value)[:60],
+                remedy="send one value per sample of each channel, null where it is missing",
+            )
+    return (dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True))
+
+
+def _row(values: Any, places: dict[str, int], place: str) -> list[float]:
+    """The values of all channels; NaN where one is missing."""
+    made = [np.nan] * len(places)
+    if not isinstance(values, dict):
+        raise _refused(f"{place}: values", values, "an object of channels")
+    for name, value in values.items():
+        if name not in places:
+            expected = f"channels among {', '.join(places)}"
+            remedy = "leave it out, or correct its name"
+            raise _refused(f"{place}: values", name, expected, remedy)
+        if value is None:
+            continue
+        try:
+            if not isinstance(value, int | float):
+                raise TypeError
+            made[places[name]] = float(value)
+        except (TypeError, OverflowError):
+            remedy = "send numbers as JSON numbers"
+            raise _refused(f"{place}: {name}", value, "a number or null", remedy) from None
+    return made

@@ -1,0 +1,395 @@
+"""What the monitor remembers: samples, states of the streams, and the log, in SQL.
+
+SQLite in a folder by default, or PostgreSQL. Samples, states and log entries of many assets are
+committed together, and what was acknowledged survives a crash of the process and of the machine.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import instance, require, whole
+from retwin.monitor.store import database
+from retwin.monitor.store.audit import START, Entry, append, canonical
+from retwin.monitor.store.database import (
+    Database,
+    assets,
+    last_entry,
+    log,
+    present,
+    samples,
+    states,
+)
+from retwin.monitor.store.updates import (
+    EARLIEST,
+    LATEST,
+    WORD,
+    Asset,
+    Committed,
+    Packed,
+    Update,
+    one_asset,
+    pack,
+)
+from retwin.serialisation.files import refusing
+from retwin.serialisation.places import in_use
+
+if TYPE_CHECKING:
+    import sqlalchemy as sa
+else:
+    sa = database.sa
+
+FILE = "monitor.sqlite"
+"""The database in the folder of the store, where no other is given."""
+ROWS = 4096
+"""Rows that are read at once."""
+SURPLUS = 0.1
+"""Share of `max_samples` by which an asset may exceed it, so that samples are removed in groups."""
+
+
+class Store:
+    """A store in a folder; a context manager that closes it.
+
+    One process at a time opens a store to write. After an error in `commit`, nothing of it was
+    acknowledged: read state and head again before the next one, since a database whose connection
+    broke may have stored all of it. The methods may be called in any thread.
+
+    Parameters
+    ----------
+    folder : path
+        The folder of the store, which is made. It holds `monitor.sqlite` and versions of twins.
+    url : str, optional
+        A PostgreSQL database instead, "postgresql://user@host/name".
+    max_samples : int, optional
+        Samples of each asset that are kept, up to 10 % more, the oldest removed first; by default
+        all. Entries of the log are never removed.
+    read_only : bool
+        Whether to read only, also beside the process that writes.
+
+    Raises
+    ------
+    InputError
+        Another process writes to the store, its schema is newer, it is no store, it is on a disk
+        or server that does not promise durability, or a package of the extra is missing.
+
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        url: str = "",
+        *,
+        max_samples: int | None = None,
+        read_only: bool = False,
+    ) -> None:
+        if max_samples is not None:
+            whole("max_samples", max_samples, least=1)
+        self.folder = Path(folder)
+        self.read_only = read_only
+        self._max_samples = max_samples
+        self.lock = threading.RLock()
+        """Held while a thread reads something and writes what depends on it."""
+        self._last: Entry | None = None
+        self._assets: dict[str, tuple[int, int]] | None = None
+        """Key and channels of each asset by its name; None if they must be read."""
+        self._held: dict[int, _Held] = {}
+        with ExitStack() as opened:
+            if not read_only:
+                opened.enter_context(in_use(self.folder))
+            self._database = Database(self.folder / FILE, url, read_only=read_only)
+            opened.callback(self._database.close)
+            with self._database.reporting():
+                self._database.open()
+                if not read_only:
+                    self._shrink()
+            self._opened = opened.pop_all()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the store, so that another process may write; once more is no error."""
+        with self.lock:
+            self._opened.close()
+
+    def add_asset(self, asset: Asset) -> None:
+        """Add an asset, or replace the settings and the version of one; durable on return.
+
+        Raises
+        ------
+        InputError
+            Its name is empty, longer than 200 characters or not printable, or one of this name
+            has another number of channels.
+
+        """
+        name = instance("name", asset.name, str, remedy="give the asset's name as text")
+        require(
+            0 < len(name) <= 200 and name.isprintable(),
+            "name",
+            expected="from 1 to 200 printable characters",
+            got=repr(name[:80]),
+            remedy="rename the asset",
+        )
+        if asset.version is not None:
+            whole("version", asset.version, most=2**31 - 1)
+        row = {
+            "channels": whole("channels", asset.channels, least=1, most=10_000),
+            "settings": canonical(asset.settings),
+            "version": asset.version,
+        }
+        with self._writing() as connection:
+            known = self._known(connection).get(name)
+            if known is None:
+                connection.execute(assets.insert().values(name=name, **row))
+            else:
+                require(
+                    known[1] == asset.channels,
+                    "channels",
+                    expected=f"{known[1]}, as the asset {name} has",
+                    got=asset.channels,
+                    remedy="add the machine under another name",
+                )
+                connection.execute(assets.update().where(assets.c.id == known[0]).values(row))
+            self._assets = None
+
+    def assets(self) -> list[Asset]:
+        """All assets in the order in which they were added."""
+        with self._reading() as connection:
+            rows = connection.execute(assets.select().order_by(assets.c.id)).all()
+        loaded = [(row, Entry(0, "", row.settings, "", "").data) for row in rows]
+        return [Asset(row.name, row.channels, data, row.version) for row, data in loaded]
+
+    def commit(
+        self, updates: Sequence[Update] = (), entries: Sequence[tuple[str, Mapping]] = ()
+    ) -> Committed:
+        """Store samples, states and log entries, all or none; durable on return.
+
+        Parameters
+        ----------
+        updates : sequence of Update
+            New samples and states of assets, each asset at most once.
+        entries : sequence of (str, mapping)
+            Kinds and data of new entries of the log, see `retwin.monitor.store.audit.canonical`.
+
+        Raises
+        ------
+        InputError
+            An asset is unknown, an array has another shape, the data of an entry are not JSON's,
+            the disk is full or the database fails. Nothing was stored or acknowledged.
+
+        """
+        with self._writing() as connection:
+            known = self._known(connection)
+            packed = [pack(each, known) for each in updates]
+            names = [each.asset for each in packed]
+            require(
+                len(set(names)) == len(names),
+                "updates",
+                expected="one per asset",
+                got="several of one",
+                remedy="join the samples of an asset",
+            )
+            repeated = {}
+            rows = []
+            for each in packed:
+                new = self._new(connection, each)
+                if not new.all():
+                    repeated[each.asset] = each.times[~new]
+                rows += [each.rows[i] for i in np.flatnonzero(new)]
+            self._database.insert(connection, samples, rows)
+            latest = [each.state for each in packed if each.state]
+            if latest:
+                keys = [row[0] for row in latest]
+                connection.execute(states.delete().where(states.c.asset.in_(keys)))
+            self._database.insert(connection, states, latest)
+            chained = []
+            for kind, data in entries:
+                self._last = append(self._last, kind, data)
+                chained.append(self._last)
+            self._database.insert(connection, log, [astuple(entry) for entry in chained])
+            for each in packed:
+                self._remove_surplus(connection, each.key)
+        return Committed(repeated, chained)
+
+    def samples(self, asset: str, after: int | None = None) -> Iterator[tuple[NDArray, NDArray]]:
+        """The samples of an asset after a stream time, in order of time, part by part.
+
+        Parameters
+        ----------
+        asset : str
+            Its name.
+        after : int, optional
+            Stream time in nanoseconds; by default all samples.
+
+        Yields
+        ------
+        (array (n,), array (n, channels))
+            Times in nanoseconds and values. Samples that are added meanwhile may be among them.
+
+        """
+        key, channels = self._asset(asset)
+        low = EARLIEST if after is None else whole("after", after, least=EARLIEST, most=LATEST)
+        chosen = samples.select().where(samples.c.asset == key).order_by(samples.c.time)
+        inclusive = after is None
+        while True:
+            later = samples.c.time >= low if inclusive else samples.c.time > low
+            with self._reading() as connection:
+                rows = connection.execute(chosen.where(later).limit(ROWS)).all()
+            if not rows:
+                return
+            times = np.array([row.time for row in rows], dtype=np.int64)
+            with refusing(f"samples of {asset}", expected="stored values", remedy="restore a copy"):
+                joined = b"".join(row.packed for row in rows)
+                values = np.frombuffer(joined, WORD).reshape(len(rows), channels)
+            yield times, values.astype(float)
+            low, inclusive = int(times[-1]), False
+
+    def state(self, asset: str) -> tuple[int, dict[str, NDArray]] | None:
+        """Stream time in nanoseconds and arrays of the last state of an asset; None without one."""
+        from safetensors.numpy import load
+
+        key, _ = self._asset(asset)
+        with self._reading() as connection:
+            row = connection.execute(states.select().where(states.c.asset == key)).one_or_none()
+        if row is None:
+            return None
+        with refusing(f"state of {asset}", expected="stored arrays", remedy="restore a copy"):
+            return row.time, load(row.arrays)
+
+    def present(self, asset: str, times: NDArray) -> NDArray:
+        """Those of the times (n,), in nanoseconds, at which samples of an asset are stored."""
+        if not len(times):
+            return np.zeros(0, dtype=np.int64)
+        key, _ = self._asset(asset)
+        with self._reading() as connection:
+            return present(connection, key, times)
+
+    def log(self, kind: str | None = None, after: int = -1) -> Iterator[Entry]:
+        """The entries of the log in their order, or those of one kind, read part by part.
+
+        With `after`, only those whose sequence, from 0 on, is larger.
+        """
+        chosen = log.select().order_by(log.c.sequence).limit(ROWS)
+        if kind is not None:
+            chosen = chosen.where(log.c.kind == kind)
+        low = after
+        while True:
+            with self._reading() as connection:
+                rows = connection.execute(chosen.where(log.c.sequence > low)).all()
+            if not rows:
+                return
+            for row in rows:
+                yield Entry(row.sequence, row.kind, row.text, row.previous, row.hash)
+            low = rows[-1].sequence
+
+    @property
+    def head(self) -> str:
+        """The hash of the last entry of the log: keep it elsewhere to detect a cut-off log."""
+        with self._reading() as connection:
+            last = last_entry(connection)
+        return START if last is None else last.hash
+
+    def _asset(self, name: str) -> tuple[int, int]:
+        with self.lock, self._reading() as connection:
+            return one_asset(self._known(connection), name)
+
+    def _known(self, connection: Any) -> dict[str, tuple[int, int]]:
+        if self._assets is None or self.read_only:
+            rows = connection.execute(assets.select()).all()
+            self._assets = {row.name: (row.id, row.channels) for row in rows}
+        return self._assets
+
+    @contextmanager
+    def _reading(self) -> Iterator[Any]:
+        with self._database.reporting(), self._database.reader() as connection:
+            yield connection
+
+    @contextmanager
+    def _writing(self) -> Iterator[Any]:
+        """The connection that writes, in a transaction; what is known of it is read again later."""
+        require(
+            not self.read_only,
+            "store",
+            expected="one that was opened to write",
+            got="one that was opened to read only",
+            remedy="open it without read_only",
+        )
+        with self.lock, self._database.reporting():
+            try:
+                with self._database.writer() as connection:
+                    if self._database.stale:
+                        self._last = last_entry(connection)
+                        self._assets = None
+                        self._held = {}
+                        self._database.stale = False
+                    yield connection
+            except BaseException:
+                self._database.stale = True
+                raise
+
+    def _new(self, connection: Any, packed: Packed) -> NDArray:
+        """Whether each sample (n,) is neither stored nor repeated; it is counted as stored."""
+        times = packed.times
+        if not len(times):
+            return np.ones(0, dtype=bool)
+        held = self._held_by(connection, packed.key)
+        if times[0] > held.latest and (np.diff(times) > 0).all():  # the usual case: no query
+            new = np.ones(len(times), dtype=bool)
+        else:
+            new = np.zeros(len(times), dtype=bool)
+            new[np.unique(times, return_index=True)[1]] = True
+            new &= ~np.isin(times, present(connection, packed.key, times))
+        held.latest = max(held.latest, int(times.max()))
+        held.count += int(new.sum())
+        return new
+
+    def _held_by(self, connection: Any, key: int) -> _Held:
+        if key not in self._held:
+            own = samples.c.asset == key
+            latest = connection.execute(sa.select(sa.func.max(samples.c.time)).where(own)).scalar()
+            count = 0
+            if self._max_samples is not None:
+                counted = sa.select(sa.func.count()).select_from(samples).where(own)
+                count = connection.execute(counted).scalar_one()
+            self._held[key] = _Held(count, EARLIEST if latest is None else latest)
+        return self._held[key]
+
+    def _remove_surplus(self, connection: Any, key: int) -> None:
+        """Remove the oldest samples of an asset that has too many."""
+        held = self._held_by(connection, key)
+        if self._max_samples is None or held.count <= self._max_samples * (1 + SURPLUS):
+            return
+        own = samples.c.asset == key
+        times = sa.select(samples.c.time).where(own).order_by(samples.c.time)
+        place = held.count - self._max_samples - 1
+        last = connection.execute(times.limit(1).offset(place)).scalar_one()
+        connection.execute(samples.delete().where(own, samples.c.time <= last))
+        held.count = self._max_samples
+
+    def _shrink(self) -> None:
+        """Apply `max_samples` to all assets, and give free pages back."""
+        if self._max_samples is None:
+            return
+        with self._writing() as connection:
+            for key, _ in self._known(connection).values():
+                self._remove_surplus(connection, key)
+        self._database.shrink()
+
+
+@dataclass
+class _Held:
+    """The number of an asset's samples, where they are counted, and the time of the latest one."""
+
+    count: int
+    latest: int

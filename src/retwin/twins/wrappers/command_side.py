@@ -1,0 +1,157 @@
+"""`CommandSide`: any twin with a delay and offsets of its commands as parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from retwin.arrays import interpolated
+from retwin.data.segments import Segments
+from retwin.data.trajectories import Channels, Trajectories
+from retwin.progress import Progress
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.twin import (
+    Chunk,
+    Twin,
+    checked_commands,
+    nominal_outputs,
+    simulate_in_chunks,
+)
+from retwin.twins.wrappers.parameter_values import values_per_simulation
+from retwin.twins.wrappers.parametric import Parameter
+from retwin.twins.wrappers.rebuilt import TRAJECTORIES_PER_CHUNK
+from retwin.twins.wrappers.wrapper import TwinWrapper, simulate_chunk
+
+DELAY = "delay"
+"""Name of the parameter that is the delay."""
+OFFSET = "offset"
+
+
+@dataclass(frozen=True)
+class CommandSide(TwinWrapper):
+    """Any twin whose commands are delayed and offset: parameters `delay` and `offset.CHANNEL`.
+
+    The transport delay in s is the same for all actuators. Each actuator has an offset in its
+    command unit, constant from the first sample on. Both act after the faults of the reference and
+    before a stuck actuator is held; the result is clipped to the twin's limits. Other parameters
+    are passed to the wrapped twin.
+
+    Parameters
+    ----------
+    twin : Twin
+        The wrapped twin.
+    nominal : callable, optional
+        From clean commands (n, T, d_u) to the ideal output (n, T, d_y); by default the wrapped
+        twin's nominal output, which costs a second simulation.
+
+    """
+
+    twin: Twin
+    nominal: Callable[[NDArray], NDArray] | None = None
+
+    def simulate(
+        self,
+        commands: NDArray,
+        *,
+        faults: Sequence[Fault | None] | None = None,
+        seed: int,
+        progress: Progress | None = None,
+        parameters: Mapping[str, ArrayLike] | None = None,
+    ) -> Trajectories:
+        """See `TakesParameters.simulate`."""
+        commands = checked_commands(commands, self.inputs)
+        count = len(commands)
+        offsets = tuple(f"{OFFSET}.{name}" for name in self.inputs.names)
+        given = dict(parameters or {})
+        own = {name: given.pop(name) for name in (DELAY, *offsets) if name in given}
+        own_values = values_per_simulation(own, count, allowed=(DELAY, *offsets))
+        inner_values = values_per_simulation(given, count)
+        delay = own_values.get(DELAY, np.zeros(count))
+        offset = np.stack([own_values.get(name, np.zeros(count)) for name in offsets], axis=-1)
+
+        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+            rows = np.arange(len(chunk.commands))
+            options = {name: each[chunk.index] for name, each in inner_values.items()}
+            late = delay[chunk.index, None] * self.rate
+            delayed = interpolated(chunk.faulty_commands, np.arange(commands.shape[1]) - late)
+            effective = self._clipped(delayed + offset[chunk.index][:, None])
+            responses: list[Fault | None] = [
+                None if fault is None else _ResponseOnly(fault) for fault in chunk.faults
+            ]
+            simulate = partial(
+                simulate_chunk, self.twin, chunk, rows, seed=seed, parameters=options
+            )
+            _, observed = simulate(effective, responses)
+            if self.nominal is not None:
+                return nominal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
+            healthy: list[Fault | None] = [None] * len(rows)
+            nominal, _ = simulate(chunk.commands, healthy)
+            return nominal, observed
+
+        return simulate_in_chunks(
+            self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
+        )
+
+    def _clipped(self, commands: NDArray) -> NDArray:
+        """Commands (n, T, d_u) within the twin's limits: an actuator goes no further."""
+        if self.limits is None:
+            return commands
+        return np.clip(commands, self.limits.low, self.limits.high)
+
+
+def command_side_parameters(
+    inputs: Channels, *, delay: tuple[float, float], offset: float
+) -> tuple[Parameter, ...]:
+    """Declare the parameters of `CommandSide`.
+
+    Parameters
+    ----------
+    inputs : Channels
+        The d_u command channels.
+    delay : (float, float)
+        Lowest and highest delay in s; the start is the value nearest to 0.
+    offset : float
+        Highest magnitude of an offset in command units; the start is 0.
+
+    Returns
+    -------
+    tuple of Parameter
+        1 + d_u parameters, the delay first.
+
+    """
+    offsets = (
+        Parameter(f"{OFFSET}.{name}", unit, -offset, offset, 0.0)
+        for name, unit in zip(inputs.names, inputs.units, strict=True)
+    )
+    start = min(max(0.0, delay[0]), delay[1])
+    return Parameter(DELAY, "s", *delay, start), *offsets
+
+
+@dataclass(frozen=True)
+class _ResponseOnly:
+    """A fault without its effect on the reference, which has been applied already."""
+
+    fault: Fault
+
+    @property
+    def label(self) -> str:
+        """Class name of the fault."""
+        return self.fault.label
+
+    def drawn(
+        self, rng: np.random.Generator, *, steps: int, segments: int, rate: float
+    ) -> _ResponseOnly:
+        """The fault itself: its severity is fixed already."""
+        return self
+
+    def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
+        """The commands unchanged."""
+        return commands
+
+    def response(self, response: NDArray, rate: float) -> NDArray:
+        """The response with the fault."""
+        return self.fault.response(response, rate)
