@@ -68,6 +68,13 @@ def test_all_commands_fit_one_screen(narrow) -> None:
         assert "…" not in line
 
 
+@pytest.mark.parametrize("name", [name for name, each in ALL.items() if hasattr(each, "params")])
+def test_the_help_of_a_command_fits_50_lines(narrow, name: str) -> None:
+    code, out, _ = narrow(*name.split(), "--help")
+    assert code == 0
+    assert len(out.splitlines()) <= 50
+
+
 RECORDED = (
     *("data info", "data convert", "data split", "identify", "fit", "next", "study"),
     *("diagnose fit", "diagnose invert", "diagnose predict", "bundle save", "bundle predict"),
