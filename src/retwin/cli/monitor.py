@@ -315,6 +315,28 @@ def audit(
         raise typer.Exit(BAD_INPUT)
 
 
+@app.command(epilog=example("retwin monitor recalibrate store --asset press"))
+def recalibrate(
+    store: Annotated[Path, argument("STORE", "Folder of the store.")],
+    asset: Annotated[str, option("NAME", "The machine.")],
+    hours: Annotated[float, option("H", "Newest hours of which quiet ones are used.")] = 24.0,
+    new_normal: Annotated[
+        bool, option("", "A change that lasts is no fault but the new normal.", "--new-normal")
+    ] = False,
+    url: Annotated[str, option("URL", "The PostgreSQL database, if one.")] = "",
+    as_json: Json = False,
+) -> None:
+    """Propose a monitor of the last quiet hours, in the shadow of the active one."""
+    from retwin.monitor import Store
+    from retwin.monitor import recalibrate as propose
+
+    with Store(saved(store), url) as opened, bar("calibrate") as show:
+        show("monitor", 0.0)
+        version = propose(opened, asset, hours=hours, new_normal=new_normal)
+    text = f"Version {version.number}, of {version.reason}, is in the shadow of the active one."
+    answer(vars(version), text, as_json=as_json)
+
+
 def _healthy(record: Trajectories, file: Path) -> Trajectories:
     """The healthy trajectories of a file."""
     chosen = record[record.maybe_healthy]

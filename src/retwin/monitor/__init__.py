@@ -38,6 +38,7 @@ _HOME = homes(
         "store.updates": "Asset Committed Update",
         "versions.comparison": "compare",
         "versions.decision": "Decision decide",
+        "versions.recalibration": "recalibrate",
         "versions.registry": "Registry Version",
     }
 )
