@@ -77,9 +77,9 @@ def test_too_short_a_quiet_time_is_refused(tmp_path: Path, folder: Path) -> None
 
 
 def test_an_event_that_lasts_needs_the_word_that_it_is_normal(tmp_path: Path, folder: Path) -> None:
-    with watched(tmp_path / "s", folder, recorded(5, 1600, slice(600, None))) as store:
-        with pytest.raises(InputError, match="new normal"):
-            recalibrate(store, "a")
+    store = watched(tmp_path / "s", folder, recorded(5, 1600, slice(600, None)))
+    with store, pytest.raises(InputError, match="new normal"):
+        recalibrate(store, "a")
     refused = CliRunner().invoke(app, ["recalibrate", str(tmp_path / "s"), "--asset=a"])
     assert isinstance(refused.exception, InputError)
     done = CliRunner().invoke(

@@ -16,8 +16,8 @@ import numpy as np
 from retwin.data.trajectories import Trajectories
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
-from retwin.update.blackbox.estimate import WIDEST, BlackBox
 from retwin.twins.wrappers.parametric import Parameter
+from retwin.update.blackbox.estimate import WIDEST, BlackBox
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import correlation_time
 from retwin.update.dynamics.twin import DynamicsTwin
@@ -49,7 +49,9 @@ def fit_levels(observed: Trajectories) -> BlackBox:
         step=step,
         parameters=[
             Parameter(f"level of {name}", unit, -WIDEST, WIDEST, value)
-            for name, unit, value in zip(observed.outputs.names, observed.outputs.units, level.tolist(), strict=True)
+            for name, unit, value in zip(
+                observed.outputs.names, observed.outputs.units, level.tolist(), strict=True
+            )
         ],
     )
     nothing, inputs = np.zeros(1), len(observed.inputs)
@@ -67,8 +69,12 @@ def fit_levels(observed: Trajectories) -> BlackBox:
         np.ones(count),
         np.sqrt(noise),
         domain,
-        (),
+        ("rest",),
         observed.emulated,
     )
-    figures = {"order": 0.0, "parameters": float(count), "rms": float(np.sqrt(np.nanmean(residual**2)))}
+    figures = {
+        "order": 0.0,
+        "parameters": float(count),
+        "rms": float(np.sqrt(np.nanmean(residual**2))),
+    }
     return BlackBox(twin, figures, time.perf_counter() - began)
