@@ -86,10 +86,12 @@ def fit_monitor(
         sensor gives.
 
     """
-    if twin is None:
-        known = len(healthy.inputs) > 0
-        twin = (fit_black_box(healthy, "arx") if known else fit_levels(healthy)).twin
-    instance("twin", twin, DynamicsTwin, remedy="fit it by fit_dynamics")
+    twin = instance(
+        "twin",
+        _black_box(healthy) if twin is None else twin,
+        DynamicsTwin,
+        remedy="fit it by fit_dynamics",
+    )
     check_channels(twin, healthy, "healthy")
     check_magnitude("healthy", healthy)
     arl = false_alarms(false_alarms_at_most, twin.rate)
@@ -131,6 +133,13 @@ def fit_monitor(
     predictors = tuple(each.predictor for each in found)
     more = (noise, Tried(*pairs), lasting, float(alpha), predictors)
     return Monitor(twin, disturbance, scores, slack, steps, arl, *more)
+
+
+def _black_box(healthy: Trajectories) -> object:
+    """What stands for a twin where there is none."""
+    if len(healthy.inputs):
+        return fit_black_box(healthy, "arx").twin
+    return fit_levels(healthy).twin
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +124,7 @@ def _share(
     monitor: Monitor, windows: _Windows, fault: TimedFault | Stuck, size: float | None
 ) -> float:
     """The share of windows with an alarm after the onset; NaN if it cannot be simulated."""
-    changed = ({} if size is None else {"size": size}) | (
+    changed: dict[str, Any] = ({} if size is None else {"size": size}) | (
         {"end": None} if isinstance(fault, TimedFault) else {}
     )
     rate, healthy = windows.healthy.rate, windows.healthy
