@@ -93,7 +93,10 @@ def fit(
     if known is None and system is None and mapping is None and _tables(healthy):
         records = [read_signals(healthy, max_bytes)]
     else:
-        records = [_healthy(reading(file, system or _named(known)), file) for file in healthy]
+        records = [
+            _healthy(reading(file, system or _named(known, file, mapping)), file)
+            for file in healthy
+        ]
     with bar("calibrate") as show:
         show("monitor", 0.0)
         given = Trajectories.concatenate(records)
@@ -145,7 +148,7 @@ def replay(
     system = case_named(case or made.twin.case or None)
     found, rows = [], []
     for file in logs:
-        record = reading(file, system or _named(made.twin))
+        record = reading(file, system or _named(made.twin, file, mapping))
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
         found.append((file, record, watched, causes))
@@ -361,9 +364,10 @@ def _tables(files: Sequence[Path]) -> bool:
     return all(each.suffix.lower() == ".csv" for each in files)
 
 
-def _named(twin: DynamicsTwin | None) -> Any:
-    """What `read` takes for a case, by whose twin the columns of a table are named."""
-    return None if twin is None else SimpleNamespace(twin=twin)
+def _named(twin: DynamicsTwin | None, file: Path, mapping: Path | None) -> Any:
+    """What `read` takes for a case: the twin by whose channels the columns of a table are named."""
+    wanted = twin is not None and mapping is None and _tables([file])
+    return SimpleNamespace(twin=twin) if wanted else None
 
 
 def _healthy(record: Trajectories, file: Path) -> Trajectories:
