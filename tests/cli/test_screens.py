@@ -86,7 +86,7 @@ RECORDED = (
 @pytest.mark.parametrize("name", RECORDED)
 def test_recorded_data_may_be_a_log_with_a_mapping(name: str) -> None:
     (option,) = (each for each in ALL[name].params if "--mapping" in each.opts)
-    assert option.help == "For a log: what `retwin data map` wrote.", "the same everywhere"
+    assert option.help == "What `retwin data map` wrote.", "the same everywhere"
 
 
 @pytest.mark.parametrize("name", ALL)
