@@ -235,8 +235,7 @@ def segments_of(commands: Tensor, tolerance: float = 1e-6) -> Segments:
     def speed(row: NDArray, step: NDArray) -> NDArray:
         rows, steps = (torch.from_numpy(each).to(commands.device) for each in (row, step))
         after, before = (commands[rows, steps + i].double() for i in (1, 0))
-        total: NDArray = (after - before).abs().sum(dim=1).cpu().numpy()
-        return total
+        return (after - before).abs().sum(dim=1).cpu().numpy()
 
     row, edge = (np.concatenate(each) for each in zip(*edges, strict=True))
     return Segments.from_edges(len(commands), commands.shape[1], row, edge, speed)

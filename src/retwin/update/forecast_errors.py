@@ -147,8 +147,7 @@ def range_excess(values: NDArray, low: NDArray, high: NDArray) -> NDArray:
     size = np.where(high != 0, np.abs(high), 1.0)
     width = np.where(high > low, high - low, size)
     distance = np.nan_to_num(np.maximum(values - high, low - values) / width)
-    furthest: NDArray = distance.max(axis=2, initial=0.0)
-    return furthest
+    return distance.max(axis=2, initial=0.0)
 
 
 def predictive_deviation(errors: NDArray, independent: float) -> float:

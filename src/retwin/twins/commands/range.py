@@ -154,16 +154,14 @@ class CommandRange:
     @property
     def largest_share(self) -> NDArray:
         """Share (d_u,) of a trajectory's power above `band_limit` that is within the range."""
-        limit: NDArray = (1 + self.sampling_margin) * np.array(self.share) + POWER_TOLERANCE
-        return limit
+        return (1 + self.sampling_margin) * np.array(self.share) + POWER_TOLERANCE
 
     def band_limit(self, resolution: float) -> NDArray:
         """Frequency (d_u,) in Hz above which power is not that of the band, in spectra of a step.
 
         `resolution` is that step in Hz: the peak of a sine is as wide as some of them.
         """
-        limit: NDArray = np.array(self.band) + LEAKAGE * max(self.resolution, resolution)
-        return limit
+        return np.array(self.band) + LEAKAGE * max(self.resolution, resolution)
 
     def shares(self, commands: NDArray, rate: float) -> NDArray:
         """Share of the power of each trajectory's commands that lies above the band, (n, d_u)."""

@@ -50,8 +50,7 @@ class Arrow:
     @property
     def unit(self) -> NDArray:
         """Units (k + n m,) of the unknowns in which the diagonal is 1."""
-        made: NDArray = 1 / np.sqrt(np.maximum(self.diagonal, 1e-300))
-        return made
+        return 1 / np.sqrt(np.maximum(self.diagonal, 1e-300))
 
     def plus(self, diagonal: NDArray) -> Arrow:
         """The sum with a diagonal matrix (k + n m,)."""

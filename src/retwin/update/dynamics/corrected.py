@@ -344,15 +344,13 @@ def _by_parameters(twin: StateTwin, equation: int, states: NDArray, commands: ND
         return np.zeros((len(states), len(p)))
     found = torch.autograd.grad(slope.sum(), p, allow_unused=True)
     zero = torch.zeros_like(x[0])
-    made: NDArray = torch.stack([zero if each is None else each for each in found], 1).numpy()
-    return made
+    return torch.stack([zero if each is None else each for each in found], 1).numpy()
 
 
 def _scaled(columns: NDArray) -> NDArray:
     """Columns of norm 1, without those that are 0."""
     size = np.linalg.norm(columns, axis=0)
-    made: NDArray = np.divide(columns, size, out=np.zeros_like(columns), where=size > 0)
-    return made
+    return np.divide(columns, size, out=np.zeros_like(columns), where=size > 0)
 
 
 def variable_names(twin: StateTwin) -> list[str]:

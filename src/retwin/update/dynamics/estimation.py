@@ -159,16 +159,12 @@ class Estimation:
         square = np.nanmean(values**2, axis=(0, 1))
         variance = np.nanvar(values, axis=(0, 1))
         constant = np.where(square > 0, square, 1.0)
-        made: NDArray = np.where(variance > RESOLUTION * square, variance, constant)
-        return made
+        return np.where(variance > RESOLUTION * square, variance, constant)
 
     def power(self, residual: NDArray, seen: NDArray | None = None) -> NDArray:
         """Mean squares (d_y,), above 0, of a residual (n, T, d_y) that is 0 where not `seen`."""
         count = np.maximum((self.seen if seen is None else seen).sum(axis=(0, 1)), 1)
-        made: NDArray = np.maximum(
-            np.sum(residual**2, axis=(0, 1)) / count, RESOLUTION * self.spread
-        )
-        return made
+        return np.maximum(np.sum(residual**2, axis=(0, 1)) / count, RESOLUTION * self.spread)
 
     def rms(self, residual: NDArray, part: NDArray | None = None) -> float:
         """Root mean square of a residual, relative where the outputs have several units.
@@ -268,8 +264,7 @@ class Estimation:
     def _pressed(self, flat: NDArray, gradient: NDArray) -> NDArray:
         """Which coordinates (k + n m,) are at a bound beyond which the objective falls."""
         low, high = self.bounds
-        made: NDArray = ((flat <= low) & (gradient > 0)) | ((flat >= high) & (gradient < 0))
-        return made
+        return ((flat <= low) & (gradient > 0)) | ((flat >= high) & (gradient < 0))
 
     def _curvature(self, at: Linearised) -> Arrow:
         """The Gauss-Newton curvature of the objective."""
@@ -318,8 +313,7 @@ class Estimation:
         curvature = self._curvature(at)
         values, directions = np.linalg.eigh(curvature.scaled(curvature.unit).reduced()[0])
         free = np.abs(directions[:, values <= RESOLUTION * len(values)])
-        made: NDArray = (free > np.sqrt(RESOLUTION)).any(axis=1)
-        return made
+        return (free > np.sqrt(RESOLUTION)).any(axis=1)
 
     def confounded(self, at: Linearised) -> NDArray:
         """Combinations (r, k) of shared coordinates, each of which acts, that act together on none.
@@ -360,8 +354,7 @@ class Estimation:
 def root(covariance: NDArray) -> NDArray:
     """A matrix whose product with its transpose is a covariance."""
     values, directions = np.linalg.eigh(covariance)
-    made: NDArray = directions * np.sqrt(np.maximum(values, 0.0))
-    return made
+    return directions * np.sqrt(np.maximum(values, 0.0))
 
 
 def correlation_time(residual: NDArray) -> float:

@@ -132,5 +132,4 @@ class DynamicsFilter:
         largest = self.domain.high[:count] - self.domain.low[:count]
         with np.errstate(invalid="ignore"):
             change = np.abs(np.diff(states, axis=1, append=states[:, -1:]))
-        made: NDArray = self.process + self.proportional * np.fmin(change, largest) ** 2
-        return made
+        return self.process + self.proportional * np.fmin(change, largest) ** 2

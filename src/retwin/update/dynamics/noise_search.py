@@ -66,8 +66,7 @@ class Visited:
     @property
     def best(self) -> NDArray:
         """The point (w,) with the highest likelihood."""
-        made: NDArray = self.points[self.scores.sum(axis=1).argmax()]
-        return made
+        return self.points[self.scores.sum(axis=1).argmax()]
 
     @property
     def held_out(self) -> NDArray:
@@ -113,8 +112,7 @@ class Search:
     @cached_property
     def counted(self) -> NDArray:
         """Samples (n, T) of the parts."""
-        made: NDArray = np.any(np.stack(list(self.parts)), axis=0)
-        return made
+        return np.any(np.stack(list(self.parts)), axis=0)
 
     @cached_property
     def _given(self) -> tuple[NDArray, NDArray, NDArray]:
@@ -197,7 +195,7 @@ class _Climb:
 
     def descended(self, start: NDArray, calls: int, size: float) -> NDArray:
         """The best point of a simplex of Nelder and Mead, which needs no derivatives."""
-        found: NDArray = minimize(
+        return minimize(
             self.cost,
             start,
             method="Nelder-Mead",
@@ -209,7 +207,6 @@ class _Climb:
                 "fatol": 0.1,
             },
         ).x
-        return found
 
     def climbed(self, start: NDArray, steps: int) -> NDArray:
         """The point after some steps of scoring, each damped until it is better."""

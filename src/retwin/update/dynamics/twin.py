@@ -327,8 +327,7 @@ class DynamicsTwin:
         )
         values = np.tile(self.values[: -len(self.process)], (len(states), 1))
         p = list(torch.tensor(values if changes is None else values + changes).unbind(1))
-        made: NDArray = torch.stack(self.equations.model.evaluate("slope", x, u, p), 1).numpy()
-        return made
+        return torch.stack(self.equations.model.evaluate("slope", x, u, p), 1).numpy()
 
     @property
     def axes(self) -> list[tuple[str, str]]:
