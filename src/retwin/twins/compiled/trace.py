@@ -25,12 +25,12 @@ ELEMENTWISE: dict[str, Callable[..., Node]] = {
     "rsqrt": lambda a: a.program.node("div", 1.0, a.program.node("sqrt", a)),
     "sigmoid": lambda a: _sigmoid(a),
     "silu": lambda a: a * _sigmoid(a),
-    "relu": lambda a: _larger(a, a.program.constant(0.0)),
+    "relu": lambda a: _extreme("ge", a, a.program.constant(0.0)),
     "abs": lambda a: _where("lt", a, 0.0, a.program.node("neg", a), a),
     "sign": lambda a: _where("gt", a, 0.0, 1.0, _where("lt", a, 0.0, -1.0, a)),
     "sgn": lambda a: ELEMENTWISE["sign"](a),
-    "maximum": lambda a, b: _larger(a, b),
-    "minimum": lambda a, b: _smaller(a, b),
+    "maximum": lambda a, b: _extreme("ge", a, b),
+    "minimum": lambda a, b: _extreme("le", a, b),
     "bitwise_not": lambda a: a.program.node("logical_not", a),
     "bitwise_and": lambda a, b: a.program.node("logical_and", a, b),
     "bitwise_or": lambda a, b: a.program.node("logical_or", a, b),
@@ -246,15 +246,10 @@ def _where(comparison: str, a: Node, b: Node | float, yes: Node | float, no: Nod
     return n("where", n(comparison, a, b), yes, no)
 
 
-def _larger(a: Node, b: Node) -> Node:
-    """The larger of two; NaN if one of them is, as in torch and unlike fmax."""
+def _extreme(comparison: str, a: Node, b: Node) -> Node:
+    """The larger ("ge") or smaller ("le") of two; NaN if one is, as in torch and unlike fmax."""
     n = a.program.node
-    return n("where", n("logical_or", n("ge", a, b), n("ne", a, a)), a, b)
-
-
-def _smaller(a: Node, b: Node) -> Node:
-    n = a.program.node
-    return n("where", n("logical_or", n("le", a, b), n("ne", a, a)), a, b)
+    return n("where", n("logical_or", n(comparison, a, b), n("ne", a, a)), a, b)
 
 
 def _sigmoid(a: Node) -> Node:

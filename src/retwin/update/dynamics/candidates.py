@@ -188,11 +188,8 @@ def better(candidate: Candidate, other: Candidate) -> bool:
 def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin:
     """The twin whose parameters start at a point."""
     values = unknowns.offset + unknowns.matrix @ point.shared
-    parameters = (
-        replace(each, start=value, low=min(each.low, value), high=max(each.high, value))
-        for each, value in zip(base.parameters, values.tolist(), strict=True)
-    )
-    return replace(base, parameters=tuple(parameters))
+    pairs = zip(base.parameters, values.tolist(), strict=True)
+    return replace(base, parameters=tuple(each.with_start(value) for each, value in pairs))
 
 
 def _forms(
