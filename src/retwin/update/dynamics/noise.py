@@ -83,10 +83,10 @@ def fit_noise(
             noise=np.maximum(scale * made.noise, SMALLEST**2 * twin.noise),
         )
 
-    found = search.visited()
+    found = search.visit()
     made = scaled(found.best)
     if 0.5 ** len(parts) < CHANCE:  # fewer parts cannot show it
-        more = search.visited(found.best)
+        more = search.visit(found.best)
         if more.decided(found):
             return replace(scaled(more.best), free_process=made.free_process)
     return made
