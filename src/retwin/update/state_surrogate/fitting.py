@@ -22,7 +22,7 @@ from retwin.twins.limits import Limits
 from retwin.twins.twin import Twin, checked_seed
 from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.state_surrogate.equations import ChannelScale
-from retwin.update.state_surrogate.search import Found, relative_error, searched
+from retwin.update.state_surrogate.search import Found, StateSearch, relative_error
 from retwin.update.state_surrogate.simulations import (
     MIN_SIMULATIONS,
     Simulations,
@@ -212,15 +212,14 @@ def fit_state_surrogate(
     check_outputs(training)
     expected = None if observed is None else twin.simulate(own[-1], seed=0)
     report(0.2)
-    found, history = searched(
-        training,
-        held_out,
+    search = StateSearch(
         orders=settings.states,  # type: ignore[arg-type]  # a tuple
         hidden=settings.hidden,
         accuracy=settings.accuracy,
         enough=_enough(settings.sufficient, training, expected, observed),
-        seed=seed,
-        progress=lambda share: report(0.2 + 0.7 * share),
+    )
+    found, history = search.run(
+        training, held_out, seed=seed, progress=lambda share: report(0.2 + 0.7 * share)
     )
     unknown = settings.unknown_start or first is not None
     made = _twin_of(twin, found, free, training, own, unknown_start=unknown)
