@@ -113,9 +113,7 @@ class ForecastErrors:
         if values is None:
             return None
         leads = np.array([np.inf if each is None else each for each in values["leads"]], float)
-        arrays = {
-            name: np.array(values[name], dtype=float) for name in (*BY_LEAD, "low", "high")
-        }
+        arrays = {name: np.array(values[name], dtype=float) for name in (*BY_LEAD, "low", "high")}
         rows, low, high = [arrays[name] for name in BY_LEAD], arrays["low"], arrays["high"]
         require(
             all(each.ndim == 2 and len(each) == len(leads) for each in rows)

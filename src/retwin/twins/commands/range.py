@@ -221,14 +221,14 @@ def extremes(values: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         series = series.astype(np.float64)
     change = np.abs(series[:, 1:] - series[:, :-1])
     found = (
-        _reduced(np.minimum, series),
-        _reduced(np.maximum, series),
-        _reduced(np.maximum, change) if change.shape[1] else np.zeros_like(series[:, 0]),
+        _reduce(np.minimum, series),
+        _reduce(np.maximum, series),
+        _reduce(np.maximum, change) if change.shape[1] else np.zeros_like(series[:, 0]),
     )
     return tuple(each.astype(np.float64) for each in found)  # type: ignore[return-value]
 
 
-def _reduced(function: np.ufunc, series: NDArray) -> NDArray:
+def _reduce(function: np.ufunc, series: NDArray) -> NDArray:
     """The reduction (n, d) of (n, T, d) over time, by halves: numpy's own is many times slower
     where d is small.
     """

@@ -91,7 +91,7 @@ class RampSampler(Timed):
     start: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        low, high = _checked_limits(self.low, self.high)
+        low, high = _check_limits(self.low, self.high)
         rest = np.array(self.rest)
         require(
             rest.shape == low.shape and bool(((low <= rest) & (rest <= high)).all()),
@@ -184,7 +184,7 @@ class HoldSampler(Timed):
     hold_durations: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        _checked_limits(self.low, self.high)
+        _check_limits(self.low, self.high)
         self.check_steps()
         require(
             np.isfinite(self.hold_durations).all()
@@ -258,7 +258,7 @@ class MultisineSampler(Timed):
     deviation: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        low, high = _checked_limits(self.low, self.high)
+        low, high = _check_limits(self.low, self.high)
         self.check_steps()
         mean, deviation = self.mean or (low + high) / 2, self.deviation or (high - low) / 6
         fits = np.shape(mean) == np.shape(deviation) == low.shape
@@ -366,7 +366,7 @@ class RecordedSampler(Timed):
         return self.commands[row, begin + np.arange(self.steps)].astype(np.float32)
 
 
-def _checked_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[NDArray, NDArray]:
+def _check_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[NDArray, NDArray]:
     """Both as arrays (d_u,), finite and in order."""
     lower, upper = np.array(low, float), np.array(high, float)
     paired = lower.ndim == 1 and lower.shape == upper.shape and len(lower) > 0

@@ -185,7 +185,7 @@ class Estimation:
         flat = at.point.flat
         if not flat.size:
             return at
-        value, gradient, curvature = self._expanded(at)
+        value, gradient, curvature = self._expand(at)
         unit = curvature.unit
         radius, idle = WIDEST / 1e3, 0
         for _ in range(steps):
@@ -200,7 +200,7 @@ class Estimation:
                 break
             inside = np.clip(flat + unit * step, *self.bounds)
             tried = self.linearised(self.point(inside))
-            found = self._expanded(tried)
+            found = self._expand(tried)
             ratio = (value - found[0]) / expected
             if ratio < 0.25:
                 radius = length / 4
@@ -215,19 +215,19 @@ class Estimation:
 
     def rest(self, at: Linearised) -> float:
         """The objective in nats that a Gauss-Newton step from a point would leave."""
-        return self._expanded(at)[0] - self.gain(at) if at.finite else np.inf
+        return self._expand(at)[0] - self.gain(at) if at.finite else np.inf
 
     def gain(self, at: Linearised) -> float:
         """The decrease of the objective, in nats, by a Gauss-Newton step from a point."""
         if not at.finite:
             return -np.inf
-        _, gradient, curvature = self._expanded(at)
+        _, gradient, curvature = self._expand(at)
         unit = curvature.unit
         scaled = curvature.scaled(unit)
         step = trust_region_step(scaled, unit * gradient, WIDEST)
         return -float(step @ (unit * gradient + scaled.times(step) / 2))
 
-    def _expanded(self, at: Linearised) -> tuple[float, NDArray, Arrow]:
+    def _expand(self, at: Linearised) -> tuple[float, NDArray, Arrow]:
         """The objective at a point, its gradient (k + n m,) and Gauss-Newton curvature.
 
         A coordinate at its bound is held where the objective would take it further. Where the

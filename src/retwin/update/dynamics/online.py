@@ -144,17 +144,17 @@ class OnlineFilter:
         """
         learn = np.ones(len(commands), dtype=bool) if learn is None else learn
         if self.twin.equations.interpolation != "spline":
-            return self._passed(state, commands, measured, seen, learn)
+            return self._advance(state, commands, measured, seen, learn)
         found = []
         for t in range(commands.shape[1]):  # a later command would change the spline
             part = slice(t, t + 1)
             own = commands[:, part], measured[:, part], seen[:, part]
-            state, *more = self._passed(state, *own, learn)
+            state, *more = self._advance(state, *own, learn)
             found.append(more)
         mean, covariance = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
         return state, mean, covariance
 
-    def _passed(
+    def _advance(
         self,
         state: FilterState,
         commands: NDArray,

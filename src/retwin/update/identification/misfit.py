@@ -179,7 +179,7 @@ def misfit_of(
     """
     checked_seed(seed)
     whole("processes", processes, least=1)
-    stride = _checked(twin, observed, rate)
+    stride = _check_data(twin, observed, rate)
     windows = None
     if state_based(twin):
         windows = windows_of(twin, observed, length, sampled(observed.mask, stride))
@@ -221,7 +221,7 @@ def _in_worker(
         return _outputs(twin, commands, stride, seed, theta)
 
 
-def _checked(twin: ParametricTwin, observed: Trajectories, rate: float | None) -> int:
+def _check_data(twin: ParametricTwin, observed: Trajectories, rate: float | None) -> int:
     """The stride of the residuals; InputError if twin and data do not fit each other."""
     require(
         isinstance(twin, ParametricTwin),
