@@ -96,14 +96,10 @@ class ExactSurrogate(OfTwin):
         if state_names(self.twin):
             about["equations"] = equations_of(with_present_values(self.twin))  # type: ignore[arg-type]
         else:
-            require(
-                case is not None,
-                "twin",
-                expected="a StateTwin, or a surrogate, which can be opened again",
-                got=type(self.twin).__name__,
-                remedy="fit a surrogate of it (fit_surrogate)",
-            )
-            about["case"] = case
+            expected = "a StateTwin, or a surrogate, which can be opened again"
+            remedy = "fit a surrogate of it (fit_surrogate)"
+            got = type(self.twin).__name__
+            about["case"] = given("twin", case, expected, got=got, remedy=remedy)
             if isinstance(self.twin, ParametricTwin):
                 about["values"] = dict(zip(self.twin.names, self.twin.values, strict=True))
         save_model(folder, KIND, about, {})

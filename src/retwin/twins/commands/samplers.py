@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import require, whole
 from retwin.times import sample_rate, to_samples
 from retwin.twins.commands.ramps import draw_onsets, ramps_and_holds
 from retwin.twins.time_step import Timed
@@ -101,13 +101,8 @@ class RampSampler(Timed):
             remedy="leave start out to begin in the middle of the limits",
         )
         self.check_steps()
-        require(
-            1 <= self.segments <= self.steps,
-            "segments",
-            expected=f"from 1 to {self.steps}, the samples of a trajectory",
-            got=self.segments,
-            remedy="give the number of levels that a trajectory goes to",
-        )
+        remedy = "give the number of levels that a trajectory goes to, a sample or more each"
+        whole("segments", self.segments, least=1, most=self.steps, remedy=remedy)
         longest = self.steps // self.segments
         require(
             np.isfinite(self.ramp_durations).all()
@@ -381,9 +376,9 @@ def _check_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[NDAr
 
 
 def _in_samples(
-    given: Sequence[float], shares: Sequence[float], whole: float, rate: float
+    given: Sequence[float], shares: Sequence[float], total: float, rate: float
 ) -> list[int]:
-    """Durations in samples: those given in s, or shares of a `whole` that last one at least."""
+    """Durations in samples: those given in s, or shares of a `total` that last one at least."""
     if given:
         return [to_samples(each, rate) for each in given]
-    return [max(1, to_samples(share * whole, rate)) for share in shares]
+    return [max(1, to_samples(share * total, rate)) for share in shares]

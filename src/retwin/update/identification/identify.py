@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.data.measured import measured_only, unmeasured
 from retwin.data.quality.copies import find_copies
 from retwin.data.trajectories import Trajectories
@@ -258,14 +258,10 @@ def _search(
         candidates = choose_length(observed, fit, stride, whole=found is not None)
         length = candidates[0].length if candidates else None
         if length is None:
-            require(
-                found is not None,
-                "observed",
-                expected="records of 200 samples or more, for a twin that cannot simulate them",
-                got=f"{observed.steps} samples",
-                remedy="choose other starts of the parameters, or give longer records",
-            )
-            assert found is not None
+            expected = "records of 200 samples or more, for a twin that cannot simulate them"
+            remedy = "choose other starts of the parameters, or give longer records"
+            got = f"{observed.steps} samples"
+            found = given("observed", found, expected, got=got, remedy=remedy)
             return replace(found, horizons=tuple(candidates))
     with begin(twin, observed, length=length) as misfit:
         again = _fit(misfit, method, missing, progress)
