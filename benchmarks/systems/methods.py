@@ -140,10 +140,11 @@ def score(model: Any, system: System, tests: rt.Trajectories) -> Mapping[str, fl
     judged = None if system.horizon is None else round(system.horizon * tests.rate)
     found = dict(zip(SCORES, averaged(model, tests, judged, warm), strict=True))
     found |= {f"ahead {n}": averaged(model, tests, n, warm)[0] for n in AHEAD}
+    found = {name: (1 if name == "coverage" else system.scale) * v for name, v in found.items()}
     if getattr(model, "forecast", None) is not None:
         for n in (*AHEAD, None):
             found |= bands(model, tests, n, warm)
-    return {name: (1 if name == "coverage" else system.scale) * v for name, v in found.items()}
+    return found
 
 
 def averaged(model: Any, tests: rt.Trajectories, samples: int | None, warm: int) -> Sequence[float]:

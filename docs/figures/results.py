@@ -1,4 +1,4 @@
-"""The figures of docs/results.md, drawn from the tables of the page itself.
+"""The figures of docs/results.md, drawn from the tables of benchmarks/results/arm.md.
 
     python docs/figures/results.py
 
@@ -15,7 +15,7 @@ from style import BLUE, GREEN, INK, MUTED, blank, dress, save, title
 
 from retwin.catalog import SOURCES
 
-PAGE = Path(__file__).parents[1] / "results.md"
+PAGE = Path(__file__).parents[2] / "benchmarks" / "results" / "arm.md"
 NUMBER = r"[+−-]?\d+(?:\.\d+)?"
 
 

@@ -7,11 +7,15 @@ check has a default. `require` states what no other check covers.
 from __future__ import annotations
 
 import importlib
+import json
 from collections.abc import Iterable, Sequence, Sized
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, distribution
 from math import inf, isfinite
 from numbers import Integral, Real
 from types import ModuleType
 from typing import Any, TypeVar
+from urllib.parse import unquote, urlsplit
 
 from retwin.errors import InputError
 
@@ -264,5 +268,15 @@ def needs_extra(module: str, extra: str, purpose: str) -> ModuleType:
             f"the package {module.partition('.')[0]}",
             expected=f"it to be installed, since it {purpose}",
             got=str(error),
-            remedy=f'install it: pip install "retwin[{extra}]"',
+            remedy=f"install it: {install_command(extra)}",
         ) from None
+
+
+def install_command(extra: str) -> str:
+    """The command that installs an extra of retwin, in a clone of the repository from there."""
+    with suppress(PackageNotFoundError):
+        about = json.loads(distribution("retwin").read_text("direct_url.json") or "{}")
+        if about.get("dir_info", {}).get("editable"):
+            folder = unquote(urlsplit(about["url"]).path)
+            return f'pip install -e "{folder}[{extra}]"'
+    return f'pip install "retwin[{extra}]"'

@@ -687,8 +687,8 @@ def test_zarr_folder_by_any_name_and_case_of_suffix(tmp_path):
 def test_without_zarr_one_line_says_how_to_install_it(tmp_path, monkeypatch):
     save(example(), tmp_path / "a.zarr")
     monkeypatch.setitem(sys.modules, "zarr", None)
-    refused(r'pip install "retwin\[scale\]"', tmp_path / "a.zarr")
-    with pytest.raises(InputError, match=r'pip install "retwin\[scale\]"'):
+    refused(r'pip install .*\[scale\]"', tmp_path / "a.zarr")
+    with pytest.raises(InputError, match=r'pip install .*\[scale\]"'):
         save(example(), tmp_path / "b.zarr")
     assert not (tmp_path / "b.zarr").exists()
     save(example(), tmp_path / "b.npz")  # nothing else needs it

@@ -655,3 +655,21 @@ def test_the_mapping_of_the_documentation_is_read_and_follows_the_schema(tmp_pat
     assert found.cut.signal in found.signals
     assert found.outputs["elbow"].from_unit == "deg"
     jsonschema.validate(tomllib.loads(text), json.loads((docs / "mapping.schema.json").read_text()))
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit", "remedy"),
+    [
+        (1000.0, "ms", r"name the column of the times time_ms, or write unit = \"ms\" in \[time\]"),
+        (1 / 86400, "days", "write the times in s, or as dates with hours, minutes and seconds"),
+    ],
+)
+def test_times_in_another_unit_are_named(
+    factor: float, unit: str, remedy: str, tmp_path: Path
+) -> None:
+    """As the median interval shows, which is a sample period in that unit."""
+    path = tmp_path / "a.csv"
+    rows = [f"{45000 + factor * place / 100:.12f},0,{place % 7}" for place in range(500)]
+    path.write_text("\n".join(["time,heater,speed", *rows, ""]))
+    with pytest.raises(InputError, match=f"as if times in {unit} were read as s; {remedy}"):
+        load(path, mapping=mapping("speed", "heater", rate=100.0))

@@ -49,27 +49,32 @@ def get(name: str) -> Case:
     """
     from retwin.cases.case import Case
     from retwin.cases.file import read_case
+    from retwin.twins.twin import Twin
 
     if Path(name).suffix.lower() == ".toml":
         return read_case(name)
     target = catalog.CASES[name].target if name in catalog.CASES else name
-    got = "no such case"
+    got, remedy = "no such case", "check the spelling, or that the file or module is there"
     if ":" in target:
         try:
             found = catalog.resolve(target)
         except (ImportError, AttributeError, ValueError) as error:
             got = str(error)
         else:
-            found = found() if callable(found) else found
+            # A twin of state equations can be called too, with commands.
+            found = found() if callable(found) and not isinstance(found, Twin) else found
             if isinstance(found, Case):
                 return found
             got = f"a {type(found).__name__}"
+            if isinstance(found, Twin):
+                remedy = f"retwin identify {name} LOG --out FOLDER writes the case of a twin: "
+                remedy += "FOLDER/updated.toml"
     raise InputError(
         f"case {name!r}",
         expected=f"{', '.join(catalog.CASES)}, a file *.toml, or package.module:object naming a "
         "Case",
         got=got,
-        remedy="check the spelling, or that the file or module is there",
+        remedy=remedy,
     )
 
 

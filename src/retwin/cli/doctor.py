@@ -21,6 +21,7 @@ from packaging.requirements import Requirement
 
 from retwin._version import __version__
 from retwin.catalog import DOWNLOADS, EXTRAS
+from retwin.checks import install_command
 from retwin.cli.options import Json, option
 from retwin.cli.terminal import FAILED, answer, table
 from retwin.data.download import cache_folder
@@ -82,7 +83,7 @@ def _installation(deep: bool) -> Iterator[Found]:
             yield module, "broken", reason or version, reason and f"install {package} again"
     for extra, entry in EXTRAS.items():
         wrong = _wrong(extra)
-        remedy = f'pip install "retwin[{extra}]"' if wrong else ""
+        remedy = install_command(extra) if wrong else ""
         yield extra, "missing", "; ".join([entry.purpose, *wrong.values()]), remedy
 
 

@@ -25,6 +25,10 @@ DAY, DAYS = 86400.0, (20000.0, 80000.0)
 SHORT, WHOLE = 1e-3, 1e-2
 """Interval from which on such numbers are seconds, and how far one of days is from whole seconds,
 relative to it: times in s have other intervals."""
+MISREAD = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "minutes": 60.0, "hours": 3600.0, "days": DAY}
+"""Seconds of the units that times without a unit may have, besides seconds."""
+SIMILAR = 1.3
+"""Ratio of two intervals up to which one may stand for the other in another unit."""
 SPELT = {"sec": "s", "seconds": "s", "µs": "us", "μs": "us"}
 """Other spellings of units."""
 
@@ -50,6 +54,14 @@ def unit_in(name: str) -> str:
     """The unit with which a name such as `time_ms` ends, "" if there is none."""
     last = name.lower().rpartition("_")[2] if "_" in name else ""
     return last if last in NANOSECONDS else ""
+
+
+def misread_unit(interval: float, period: float) -> str:
+    """The unit that makes an interval a sample period, which was read as so many s; "" if none."""
+    for unit, seconds in MISREAD.items():
+        if 1 / SIMILAR < interval * seconds / period < SIMILAR:
+            return unit
+    return ""
 
 
 def row_times(values: NDArray, unit: str, clock: Clock, where: str) -> NDArray:

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.catalog import SOURCES, metrics_with
+from retwin.data.quality.finding import Finding
 from retwin.data.trajectories import Trajectories
+from retwin.diagnosis.labels import find_wrong_labels
 from retwin.diagnosis.pooled import pool_probabilities
 from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
 from retwin.scores.bootstrap import Draws, Resampling, bootstrap_means
@@ -21,6 +23,8 @@ from retwin.study.files import Job
 from retwin.study.work import Work
 from retwin.update.dynamics import DynamicsTwin, state_twin_of
 
+LABEL_FREE = ("none", "timing", "healthy")
+"""What sources learn of the real records that know no labels of faults."""
 CURVES = 6
 """Curves of a discrepancy that the page has room for."""
 RESAMPLINGS = 10_000
@@ -107,6 +111,16 @@ class Diagnoses:
             "fault_protocol_known": True,
         }
 
+    def findings(self) -> list[Finding]:
+        """Labels that the best source contradicts of those that have learned no real labels."""
+        free = [each for each in self.work.plan.sources if self.work.sees(each) in LABEL_FREE]
+        means = [self._probabilities(each).mean(axis=0) for each in free]
+        if not means:
+            return []
+        best = max(means, key=lambda each: np.mean(each.argmax(axis=1) == self._truth))
+        ids = self.work.files.real_data().ids[self._tested].tolist()
+        return list(find_wrong_labels(best, self._truth, self.work.case.classes, ids))
+
     def arrays(self) -> dict[str, NDArray]:
         """Arrays for `arrays.npz`."""
         names = self.work.plan.sources
@@ -175,6 +189,10 @@ class SimulatedRecords:
     def details(self, source: str) -> dict[str, Any]:
         """Simulations have no other entries."""
         return {}
+
+    def findings(self) -> list[Finding]:
+        """Records without classes have no labels that could be wrong."""
+        return []
 
     def arrays(self) -> dict[str, NDArray]:
         """See `Diagnoses.arrays`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from itertools import combinations
@@ -59,6 +60,7 @@ def write_results(
     fidelity = {name: each for name, each in scored.items() if each is not None}
     sources = {name: _source(work, found, name, drawn[name]) for name in work.plan.sources}
     checked = check_with_twin(work.case.twin, real)
+    checked = replace(checked, findings=(*checked.findings, *found.findings()))
     arrays = found.arrays() | _record_arrays(checked)
     for name, each in fidelity.items():
         arrays |= _fidelity_arrays(name, each)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import ends_in, require
+from retwin.checks import ends_in, install_command, require
 from retwin.serialisation.places import check_place
 
 TICKS = 100
@@ -43,7 +43,7 @@ def check_film(path: str | os.PathLike[str]) -> str:
         "path",
         expected="the package imageio-ffmpeg, which writes MP4",
         got="an installation without it",
-        remedy='install it: pip install "retwin[render]", or write a *.gif',
+        remedy=f"install it: {install_command('render')}, or write a *.gif",
     )
     check_place(path)
     return suffix

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pebble import ProcessExpired, ProcessPool
 
 from retwin.cases.animation.shots import GHOST, PAPER, Camera, Pictures, Shots
-from retwin.checks import require
+from retwin.checks import install_command, require
 from retwin.errors import InputError, brief
 from retwin.workers.pools import worker_pool
 
@@ -76,7 +76,7 @@ def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator
         "renderer",
         expected="the package pyopengl, which draws solid bodies",
         got="an installation without it",
-        remedy='install it: pip install "retwin[render]"',
+        remedy=f"install it: {install_command('render')}",
     )
     stage = _Stage(str(body.model), body.joints, Camera.of(shots, size))
     named = os.environ.get("MUJOCO_GL", "").lower()

@@ -18,9 +18,10 @@ from retwin.data.logs.channels import Channel, channels_of, in_order, signal_of,
 from retwin.data.logs.cutting import Piece, pieces
 from retwin.data.logs.mapping import NO_NOMINAL, Mapping, read_mapping
 from retwin.data.logs.reading import read_log
-from retwin.data.logs.signals import Log
+from retwin.data.logs.signals import NANOSECONDS, Log, Signal
 from retwin.data.provenance import Provenance
 from retwin.data.resampling import SAME
+from retwin.data.row_times import misread_unit
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
@@ -119,7 +120,7 @@ def parts_of(
         trigger = in_order(signal_of(log, mapping.cut.signal), log.name)[0]
     every = [each.signal for each in (*commands, *measured, *ideal)]
     parts = pieces(mapping.cut, every, [each.signal for each in commands], trigger)
-    _check_dense(log, parts, rate, max(len(each.times) for each in every), budget, len(every))
+    _check_dense(log, parts, rate, max(every, key=lambda each: len(each.times)), budget, len(every))
     shortest = max(2, round((mapping.cut.min_length or 0.0) * rate))
     for piece in parts:
         found.add(piece, shortest)
@@ -306,16 +307,20 @@ def _rate(mapping: Mapping, case: DataCase | None, rate: float | None) -> float:
 
 
 def _check_dense(
-    log: Log, parts: Sequence[Piece], rate: float, values: int, budget: Budget, width: int
+    log: Log, parts: Sequence[Piece], rate: float, densest: Signal, budget: Budget, width: int
 ) -> None:
-    """Refuse times that are so far apart that there are many more samples than values."""
+    """Refuse times in another unit, and times between which there are many more samples."""
     samples = sum(each.stop - each.start for each in parts) * rate
-    require(
-        samples <= SPARSE * max(values, 2),
-        log.name,
-        expected=f"values about {1 / rate:g} s apart, the sample period",
-        got=f"{values} values in {samples / rate:g} s",
-        remedy='check rate, and column and unit of [time], in the mapping; by = "gap" in [cut] '
-        "leaves out pauses",
-    )
+    values, span = len(densest.times), samples / rate
+    remedy = 'check rate, and column and unit of [time], in the mapping; by = "gap" in [cut] '
+    remedy += "leaves out pauses"
+    got, wrong = f"{values} values in {span:g} s", samples > SPARSE * max(values, 2)
+    unit = misread_unit(span / max(values - 1, 1), 1 / rate) if wrong or samples < 1 else ""
+    if unit:
+        got += f", as if times in {unit} were read as s"
+        remedy = f'name the column of the times time_{unit}, or write unit = "{unit}" in [time]'
+        if unit not in NANOSECONDS:
+            remedy = "write the times in s, or as dates with hours, minutes and seconds"
+    expected = f"values about {1 / rate:g} s apart, the sample period"
+    require(not (wrong or unit), log.name, expected=expected, got=got, remedy=remedy)
     budget.take(int(samples) * width * 8)
