@@ -16,6 +16,7 @@ from __future__ import annotations
 import sys
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +28,13 @@ from retwin.cases.styrofoam_incubator.case import measurements
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update import fit_dynamics
-from retwin.update.dynamics import noise_search
-from retwin.update.dynamics.noise_search import Search, Visited
+from retwin.update.dynamics.noise_search import Search, SearchSettings, Visited
 
-SIMPLICES = {"CLIMBS": (), "DRAWN": 16, "ROUGH": -np.inf, "SIMPLEX": (1, 0.3)}
-"""Settings with which a search has simplices alone."""
-SCORING = {name: getattr(noise_search, name) for name in SIMPLICES}
-WAYS = {"simplices": SIMPLICES, "scoring": SCORING}
+WAYS = {
+    "simplices": SearchSettings(climbs=(), points=16, rough=-np.inf, simplex=(1, 0.3)),
+    "scoring": SearchSettings(),
+}
+"""Settings of the searches: simplices alone, and the default."""
 FRICTION = 0.15
 """Dry friction of the emulated motor in N m."""
 
@@ -69,29 +70,31 @@ def drive() -> tuple[StateTwin, rt.Trajectories]:
 def searches(twin: StateTwin, calibration: rt.Trajectories) -> list[tuple[Search, bool, Visited]]:
     """The searches of a fit, whether noise is in proportion, and what they visited."""
     found = []
-    whole = Search.visited
+    whole = Search.visit
 
     def kept(self: Search, constant: np.ndarray | None = None) -> Visited:
         made = whole(self, constant)
         found.append((self, constant is not None, made))
         return made
 
-    Search.visited = kept  # type: ignore[method-assign]
+    Search.visit = kept  # type: ignore[method-assign]
     try:
         fit_dynamics(twin, calibration)
     finally:
-        Search.visited = whole  # type: ignore[method-assign]
+        Search.visit = whole  # type: ignore[method-assign]
     return found
 
 
-def measured(made: list[tuple[Search, bool, Visited]], settings: dict) -> list[tuple[float, ...]]:
+def measured(
+    made: list[tuple[Search, bool, Visited]], settings: SearchSettings
+) -> list[tuple[float, ...]]:
     """Calls, seconds, log likelihood, and whether the second search is decided for."""
-    for name, value in settings.items():
-        setattr(noise_search, name, value)
     rows, before = [], None
     for search, proportional, _ in made:
         started = time.process_time()
-        found = search.visited(before.best if proportional and before else None)
+        found = replace(search, settings=settings).visit(
+            before.best if proportional and before else None
+        )
         seconds = time.process_time() - started
         decided = float(found.decided(before)) if before else np.nan
         rows.append((len(found.points), seconds, float(found.scores.sum(axis=1).max()), decided))

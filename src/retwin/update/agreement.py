@@ -46,7 +46,7 @@ def check_with_twin(twin: Twin | None, records: Trajectories) -> Checked:
     if twin is None or ideal is None:
         return check_records(records)
     found = check_records(records.replace(nominal=ideal))
-    return replace(found, findings=(*_exchanged(twin, found.records), *found.findings))
+    return replace(found, findings=(*_find_exchanged(twin, found.records), *found.findings))
 
 
 def simulated(twin: Twin, records: Trajectories) -> NDArray | None:
@@ -58,10 +58,10 @@ def simulated(twin: Twin, records: Trajectories) -> NDArray | None:
     return made if np.isfinite(made).all() else None
 
 
-def _exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
+def _find_exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
     """Pairs of commands with which the twin explains more where they are exchanged."""
     healthy = records[records.maybe_healthy] if records.maybe_healthy.any() else records
-    here, names = _unexplained(healthy), records.inputs.names
+    here, names = _unexplained_share(healthy), records.inputs.names
     if here < UNEXPLAINED:
         return
     for a, b in list(combinations(range(len(names)), 2))[:PAIRS]:
@@ -71,14 +71,14 @@ def _exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
         ideal = simulated(twin, other)
         if ideal is None:
             continue
-        there = _unexplained(other.replace(nominal=ideal))
+        there = _unexplained_share(other.replace(nominal=ideal))
         if there < min(CLEAR * here, CLEAR):
             text = f"seems to be exchanged with {names[b]}: its twin explains {1 - there:.0%} of "
             text += f"the variance that way, {1 - here:.0%} as they are"
             yield Finding("", names[a], "exchanged", text)
 
 
-def _unexplained(records: Trajectories) -> float:
+def _unexplained_share(records: Trajectories) -> float:
     """Share of the variance of outputs that nominal ones do not explain, over all outputs."""
     shares = explained_shares(records)
     return float(np.nanmean([1 - each for own in shares.values() for each in own.values()]))

@@ -129,7 +129,7 @@ class DeviceTwin:
             Commands are outside the training range of the surrogate.
 
         """
-        sent, twin = self._sent(commands), self.twin
+        sent, twin = self._send(commands), self.twin
         generator = torch.Generator(self.device).manual_seed(checked_seed(seed))
         size = whole("chunk", chunk, least=1, remedy="leave it out")
         faults = [None] * len(sent) if faults is None else faults
@@ -143,11 +143,11 @@ class DeviceTwin:
             rows = slice(begin, begin + size)
             context = self._context(sent[rows], drawn[rows], segments[rows])
             made.nominal[rows] = context.nominal
-            made.observed[rows] = self._measured(context, drawn[rows], generator)
+            made.observed[rows] = self._measure(context, drawn[rows], generator)
         _check_finite(made)
         return made
 
-    def _sent(self, commands: NDArray | Tensor) -> Tensor:
+    def _send(self, commands: NDArray | Tensor) -> Tensor:
         """The commands on the device, checked."""
         if not isinstance(commands, Tensor):
             commands = torch.from_numpy(np.array(checked_commands(commands, self.twin.inputs)))
@@ -199,7 +199,7 @@ class DeviceTwin:
             corrected=path,
         )
 
-    def _measured(
+    def _measure(
         self, context: Context, faults: Sequence[Fault | None], generator: torch.Generator
     ) -> Tensor:
         """The record (n, T, d_y) of a chunk; faults of sensors act on the processor."""
@@ -235,8 +235,7 @@ def segments_of(commands: Tensor, tolerance: float = 1e-6) -> Segments:
     def speed(row: NDArray, step: NDArray) -> NDArray:
         rows, steps = (torch.from_numpy(each).to(commands.device) for each in (row, step))
         after, before = (commands[rows, steps + i].double() for i in (1, 0))
-        total: NDArray = (after - before).abs().sum(dim=1).cpu().numpy()
-        return total
+        return (after - before).abs().sum(dim=1).cpu().numpy()
 
     row, edge = (np.concatenate(each) for each in zip(*edges, strict=True))
     return Segments.from_edges(len(commands), commands.shape[1], row, edge, speed)

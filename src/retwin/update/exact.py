@@ -20,7 +20,7 @@ from retwin.twins.equations.saved_equations import equations_from, equations_of
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import Twin
-from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.twins.wrappers.wrapper import OfTwin
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
@@ -96,14 +96,10 @@ class ExactSurrogate(OfTwin):
         if state_names(self.twin):
             about["equations"] = equations_of(with_present_values(self.twin))  # type: ignore[arg-type]
         else:
-            require(
-                case is not None,
-                "twin",
-                expected="a StateTwin, or a surrogate, which can be opened again",
-                got=type(self.twin).__name__,
-                remedy="fit a surrogate of it (fit_surrogate)",
-            )
-            about["case"] = case
+            expected = "a StateTwin, or a surrogate, which can be opened again"
+            remedy = "fit a surrogate of it (fit_surrogate)"
+            got = type(self.twin).__name__
+            about["case"] = given("twin", case, expected, got=got, remedy=remedy)
             if isinstance(self.twin, ParametricTwin):
                 about["values"] = dict(zip(self.twin.names, self.twin.values, strict=True))
         save_model(folder, KIND, about, {})
@@ -162,17 +158,12 @@ def with_present_values(twin: StateTwin | ParametricTwin) -> StateTwin:
     base, _, values = state_twin_of(twin)
     return replace(
         base,
-        parameters=tuple(_started(each, values[each.name]) for each in base.parameters),
-        states=tuple(_begun(each, values[f"start_{each.name}"]) for each in base.states),
+        parameters=tuple(each.with_start(values[each.name]) for each in base.parameters),
+        states=tuple(_start_at(each, values[f"start_{each.name}"]) for each in base.states),
     )
 
 
-def _started(parameter: Parameter, value: float) -> Parameter:
-    low, high = min(parameter.low, value), max(parameter.high, value)
-    return replace(parameter, start=value, low=low, high=high)
-
-
-def _begun(state: State, value: float) -> State:
+def _start_at(state: State, value: float) -> State:
     if state.low is None or state.high is None:
         return replace(state, start=value)
     return replace(state, start=value, low=min(state.low, value), high=max(state.high, value))

@@ -24,6 +24,8 @@ USUAL = float(ndtri((1 + LEVEL) / 2))
 """Their half width in standard deviations of a Gaussian distribution."""
 FEW = 5
 """Independent samples below which no band is promised: the 90 % quantile of four is none."""
+BY_LEAD = ("persistence", "deviation", "independent")
+"""Fields of `ForecastErrors` with a row for each time ahead, in their order."""
 BEYOND = 0.05
 """Share of the width of its range by which a value may leave it, as noise makes it."""
 
@@ -99,8 +101,7 @@ class ForecastErrors:
     def values(self) -> dict[str, Any]:
         """As JSON values; an infinite time is null."""
         leads = [each if np.isfinite(each) else None for each in self.leads.tolist()]
-        names = ("persistence", "deviation", "independent", "low", "high")
-        arrays = {name: getattr(self, name).tolist() for name in names}
+        arrays = {name: getattr(self, name).tolist() for name in (*BY_LEAD, "low", "high")}
         return {"leads": leads, **arrays, "memory": self.memory, "beyond": self.beyond}
 
     @classmethod
@@ -112,22 +113,20 @@ class ForecastErrors:
         if values is None:
             return None
         leads = np.array([np.inf if each is None else each for each in values["leads"]], float)
-        names = ("persistence", "deviation", "independent")
-        arrays = [np.array(values[name], dtype=float) for name in names]
-        low, high = (np.array(values[name], dtype=float) for name in ("low", "high"))
+        arrays = {name: np.array(values[name], dtype=float) for name in (*BY_LEAD, "low", "high")}
+        rows, low, high = [arrays[name] for name in BY_LEAD], arrays["low"], arrays["high"]
         require(
-            all(each.ndim == 2 and len(each) == len(leads) for each in arrays)
-            and all(np.isfinite(each).all() and (each >= 0).all() for each in arrays)
+            all(each.ndim == 2 and len(each) == len(leads) for each in rows)
+            and all(np.isfinite(each).all() and (each >= 0).all() for each in rows)
             and low.shape == high.shape
             and bool((low <= high).all()),
             "forecast",
             expected="one finite row for each time ahead, and ranges from low to high",
-            got=[each.shape for each in (*arrays, low, high)],
+            got=[each.shape for each in arrays.values()],
             remedy="save the model again",
         )
         memory, beyond = float(values["memory"]), float(values["beyond"])
-        persistence, deviation, independent = arrays
-        return cls(leads, persistence, deviation, independent, memory, low, high, beyond)
+        return cls(leads=leads, memory=memory, beyond=beyond, **arrays)
 
 
 def value_range(values: NDArray) -> tuple[NDArray, NDArray]:
@@ -147,8 +146,7 @@ def range_excess(values: NDArray, low: NDArray, high: NDArray) -> NDArray:
     size = np.where(high != 0, np.abs(high), 1.0)
     width = np.where(high > low, high - low, size)
     distance = np.nan_to_num(np.maximum(values - high, low - values) / width)
-    furthest: NDArray = distance.max(axis=2, initial=0.0)
-    return furthest
+    return distance.max(axis=2, initial=0.0)
 
 
 def predictive_deviation(errors: NDArray, independent: float) -> float:

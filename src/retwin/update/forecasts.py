@@ -198,7 +198,7 @@ def calibrate_forecasts(
     rows = []
     for i in range(len(leads) + 1):
         pairs = [_errors(each, i) for each in found if not each.edge]
-        rows.append([_calibrated(pairs, channel) for channel in range(len(records.outputs))])
+        rows.append([_calibrate(pairs, channel) for channel in range(len(records.outputs))])
     persistence, deviation, independent, correlation = np.moveaxis(np.array(rows), 2, 0)
     memory = float(FORGOTTEN * correlation[-1].max() / records.rate)
     beyond = max([BEYOND, *(each.excess for each in found if not each.edge)])
@@ -242,7 +242,7 @@ def _hold(part: LeftOut, deviation: NDArray) -> bool:
     return True
 
 
-def _calibrated(pairs: Sequence[tuple[NDArray, NDArray]], channel: int) -> tuple[float, ...]:
+def _calibrate(pairs: Sequence[tuple[NDArray, NDArray]], channel: int) -> tuple[float, ...]:
     """Persistence, deviation, number of independent errors, and their correlation time."""
     errors = [each[..., channel] for each, _ in pairs]
     last = np.concatenate(

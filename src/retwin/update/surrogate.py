@@ -122,10 +122,10 @@ class Surrogate(nn.Module):
         ramp (`evaluate_piecewise_linear`), which agrees with `forward` up to rounding.
         """
         with training_checked(self, commands):
-            return self._predicted(commands, progress)
+            return self._predict(commands, progress)
 
     @torch.no_grad()
-    def _predicted(self, commands: NDArray, progress: Progress | None = None) -> NDArray:
+    def _predict(self, commands: NDArray, progress: Progress | None = None) -> NDArray:
         """As `predict`, without a check of the commands."""
         values = np.ascontiguousarray(commands, dtype=np.float32)
         out = np.empty((*values.shape[:2], len(self.outputs)), dtype=np.float32)
@@ -162,8 +162,8 @@ class Surrogate(nn.Module):
         """See `Twin.simulate`; a frozen response is the output of constant commands."""
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            nominal = self._predicted(chunk.commands)
-            return nominal, self._predicted(chunk.held_commands) if any(chunk.faults) else nominal
+            nominal = self._predict(chunk.commands)
+            return nominal, self._predict(chunk.held_commands) if any(chunk.faults) else nominal
 
         checked = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
         with training_checked(self, checked):
@@ -307,7 +307,7 @@ def _hold_constant(surrogate: Surrogate, nominal: Tensor) -> None:
 def _errors(surrogate: Surrogate, twin: Trajectories, test: NDArray) -> dict[str, float]:
     """RMSE and normalised RMSE of each output on the trajectories `test`."""
     valid = known_samples(twin, test)
-    error = (surrogate._predicted(twin.commands[test]) - twin.nominal[test])[valid]
+    error = (surrogate._predict(twin.commands[test]) - twin.nominal[test])[valid]
     rmse = np.sqrt(np.square(error, dtype=np.float64).mean(axis=0))
     deviation = twin.nominal[test][valid].std(axis=0, dtype=np.float64)
     nrmse = np.divide(rmse, deviation, out=np.zeros_like(rmse), where=deviation > 0)

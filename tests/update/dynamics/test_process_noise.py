@@ -65,16 +65,16 @@ def test_it_is_left_out_where_noise_is_constant(twin: DynamicsTwin) -> None:
 def test_the_search_finds_what_a_grid_finds_with_few_calls(twin: DynamicsTwin) -> None:
     made = record(PROPORTIONAL)
     search = Search(twin, made, np.array([0]), folds(made.mask, 10), np.zeros((10, 2)))
-    found = search.visited(search.visited().best)
+    found = search.visit(search.visit().best)
     best = found.scores.sum(axis=1).max()
     assert len(found.points) < 300
     axis = np.linspace(np.log(1e-6), 0, 9)
     grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     around = found.best + np.random.default_rng(0).normal(0, 0.2, size=(200, 3))
-    assert max(search.predicted(each)[1].sum() for each in (*grid, *around)) <= best + 0.01
+    assert max(search.predict(each)[1].sum() for each in (*grid, *around)) <= best + 0.01
     # Without each part, no visited point is better for the others than the step of scoring.
     more = found.points[:, None] + np.random.default_rng(1).normal(0, 0.02, size=(3, 3))
-    scores = np.array([search.predicted(each)[1] for each in more[-40:].reshape(-1, 3)])
+    scores = np.array([search.predict(each)[1] for each in more[-40:].reshape(-1, 3)])
     others = found.scores.sum(axis=1)[:, None] - found.scores
     near = (scores.sum(axis=1)[:, None] - scores).max(axis=0)
     assert (near <= others.max(axis=0) + 0.02).all()

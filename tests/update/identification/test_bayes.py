@@ -195,6 +195,9 @@ def test_bad_input_is_named(observed: rt.Trajectories, monkeypatch: pytest.Monke
         "degrees": lambda: Noise(degrees=4.0),
         "walkers: expected a whole": lambda: MCMC(walkers=0),
         "simulations": lambda: NPE(simulations=3),
+        "components: expected a whole": lambda: NPE(components=0),
+        "learning_rate": lambda: NPE(learning_rate=0.0),
+        "tail": lambda: NPE(tail=0.5),
         "at least 6": lambda: identify(FAST, observed, MCMC(walkers=4, noise=WHITE), seed=0),
         "healthy": lambda: identify(
             FAST, observed.replace(labels=np.full(len(observed), "Stuck")), MCMC(), seed=0

@@ -51,13 +51,11 @@ def ramps_and_holds(
     commands = np.empty((len(start), steps, start.shape[1]), dtype)
     for begin in range(0, len(start), TRAJECTORIES_PER_BLOCK):
         block = slice(begin, begin + TRAJECTORIES_PER_BLOCK)
-        commands[block] = _ramped(start[block], levels[block], spans[block], onsets[block], steps)
+        commands[block] = _ramp(start[block], levels[block], spans[block], onsets[block], steps)
     return commands
 
 
-def _ramped(
-    start: NDArray, levels: NDArray, spans: NDArray, onsets: NDArray, steps: int
-) -> NDArray:
+def _ramp(start: NDArray, levels: NDArray, spans: NDArray, onsets: NDArray, steps: int) -> NDArray:
     """`ramps_and_holds` of one block; ramps are only evaluated in the samples that they span."""
     exists = ~np.isnan(onsets)
     onsets = np.where(exists, onsets, np.inf)

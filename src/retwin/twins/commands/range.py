@@ -154,16 +154,14 @@ class CommandRange:
     @property
     def largest_share(self) -> NDArray:
         """Share (d_u,) of a trajectory's power above `band_limit` that is within the range."""
-        limit: NDArray = (1 + self.sampling_margin) * np.array(self.share) + POWER_TOLERANCE
-        return limit
+        return (1 + self.sampling_margin) * np.array(self.share) + POWER_TOLERANCE
 
     def band_limit(self, resolution: float) -> NDArray:
         """Frequency (d_u,) in Hz above which power is not that of the band, in spectra of a step.
 
         `resolution` is that step in Hz: the peak of a sine is as wide as some of them.
         """
-        limit: NDArray = np.array(self.band) + LEAKAGE * max(self.resolution, resolution)
-        return limit
+        return np.array(self.band) + LEAKAGE * max(self.resolution, resolution)
 
     def shares(self, commands: NDArray, rate: float) -> NDArray:
         """Share of the power of each trajectory's commands that lies above the band, (n, d_u)."""
@@ -223,14 +221,14 @@ def extremes(values: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         series = series.astype(np.float64)
     change = np.abs(series[:, 1:] - series[:, :-1])
     found = (
-        _reduced(np.minimum, series),
-        _reduced(np.maximum, series),
-        _reduced(np.maximum, change) if change.shape[1] else np.zeros_like(series[:, 0]),
+        _reduce(np.minimum, series),
+        _reduce(np.maximum, series),
+        _reduce(np.maximum, change) if change.shape[1] else np.zeros_like(series[:, 0]),
     )
     return tuple(each.astype(np.float64) for each in found)  # type: ignore[return-value]
 
 
-def _reduced(function: np.ufunc, series: NDArray) -> NDArray:
+def _reduce(function: np.ufunc, series: NDArray) -> NDArray:
     """The reduction (n, d) of (n, T, d) over time, by halves: numpy's own is many times slower
     where d is small.
     """

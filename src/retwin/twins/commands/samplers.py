@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import require, whole
 from retwin.times import sample_rate, to_samples
 from retwin.twins.commands.ramps import draw_onsets, ramps_and_holds
 from retwin.twins.time_step import Timed
@@ -91,7 +91,7 @@ class RampSampler(Timed):
     start: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        low, high = _checked_limits(self.low, self.high)
+        low, high = _check_limits(self.low, self.high)
         rest = np.array(self.rest)
         require(
             rest.shape == low.shape and bool(((low <= rest) & (rest <= high)).all()),
@@ -101,13 +101,8 @@ class RampSampler(Timed):
             remedy="leave start out to begin in the middle of the limits",
         )
         self.check_steps()
-        require(
-            1 <= self.segments <= self.steps,
-            "segments",
-            expected=f"from 1 to {self.steps}, the samples of a trajectory",
-            got=self.segments,
-            remedy="give the number of levels that a trajectory goes to",
-        )
+        remedy = "give the number of levels that a trajectory goes to, a sample or more each"
+        whole("segments", self.segments, least=1, most=self.steps, remedy=remedy)
         longest = self.steps // self.segments
         require(
             np.isfinite(self.ramp_durations).all()
@@ -184,7 +179,7 @@ class HoldSampler(Timed):
     hold_durations: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        _checked_limits(self.low, self.high)
+        _check_limits(self.low, self.high)
         self.check_steps()
         require(
             np.isfinite(self.hold_durations).all()
@@ -258,7 +253,7 @@ class MultisineSampler(Timed):
     deviation: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        low, high = _checked_limits(self.low, self.high)
+        low, high = _check_limits(self.low, self.high)
         self.check_steps()
         mean, deviation = self.mean or (low + high) / 2, self.deviation or (high - low) / 6
         fits = np.shape(mean) == np.shape(deviation) == low.shape
@@ -366,7 +361,7 @@ class RecordedSampler(Timed):
         return self.commands[row, begin + np.arange(self.steps)].astype(np.float32)
 
 
-def _checked_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[NDArray, NDArray]:
+def _check_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[NDArray, NDArray]:
     """Both as arrays (d_u,), finite and in order."""
     lower, upper = np.array(low, float), np.array(high, float)
     paired = lower.ndim == 1 and lower.shape == upper.shape and len(lower) > 0
@@ -381,9 +376,9 @@ def _checked_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[ND
 
 
 def _in_samples(
-    given: Sequence[float], shares: Sequence[float], whole: float, rate: float
+    given: Sequence[float], shares: Sequence[float], total: float, rate: float
 ) -> list[int]:
-    """Durations in samples: those given in s, or shares of a `whole` that last one at least."""
+    """Durations in samples: those given in s, or shares of a `total` that last one at least."""
     if given:
         return [to_samples(each, rate) for each in given]
-    return [max(1, to_samples(share * whole, rate)) for share in shares]
+    return [max(1, to_samples(share * total, rate)) for share in shares]

@@ -159,24 +159,24 @@ class Model:
         ]
         for node in self.program.needed(each for _, nodes in results for each in nodes):
             if node.op in OPERATIONS:
-                text = OPERATIONS[node.op].format(*(_written(each, lanes) for each in node.args))
-                lines += _assigned(f"v{node.index}", text, lanes)
+                text = OPERATIONS[node.op].format(*(_write(each, lanes) for each in node.args))
+                lines += _assign(f"v{node.index}", text, lanes)
         for array, nodes in results:
             for i, node in enumerate(nodes):
                 place = f"{array}[{i} * LANES + l]" if lanes else f"{array}[{i}]"
                 loop = f"{LOOP} " if lanes else ""
-                lines.append(f"    {loop}{place} = {_written(node, lanes)};")
+                lines.append(f"    {loop}{place} = {_write(node, lanes)};")
         return "\n".join([*lines, "}\n"])
 
 
-def _assigned(name: str, text: str, lanes: bool) -> list[str]:
+def _assign(name: str, text: str, lanes: bool) -> list[str]:
     """Lines of C that compute a number, or one per lane."""
     if not lanes:
         return [f"    const double {name} = {text};"]
     return [f"    double {name}[LANES];", f"    {LOOP} {name}[l] = {text};"]
 
 
-def _written(node: Node, lanes: bool) -> str:
+def _write(node: Node, lanes: bool) -> str:
     """How C refers to a node."""
     if node.op == "variable":
         return f"{str(node.value)[:-1]} * LANES + l]" if lanes else str(node.value)

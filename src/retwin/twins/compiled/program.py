@@ -73,11 +73,11 @@ class Program:
 
     def variable(self, name: str) -> Node:
         """The variable of that C name."""
-        return self._interned("variable", (), name)
+        return self._intern("variable", (), name)
 
     def constant(self, value: float) -> Node:
         """The constant of that value."""
-        return self._interned("constant", (), float(value))
+        return self._intern("constant", (), float(value))
 
     def node(self, op: str, *args: Node | float) -> Node:
         """An operation; powers with the exponents 0.5 and -4 … 4 become roots and products."""
@@ -90,7 +90,7 @@ class Program:
             short = self._power(nodes[0], float(nodes[1].value))
             if short is not None:
                 return short
-        return self._interned(op, nodes, "")
+        return self._intern(op, nodes, "")
 
     def _power(self, base: Node, exponent: float) -> Node | None:
         if exponent == 0.5:
@@ -102,7 +102,7 @@ class Program:
             product = product * base
         return product if exponent > 0 else self.node("div", 1.0, product)
 
-    def _interned(self, op: str, args: tuple[Node, ...], value: float | str) -> Node:
+    def _intern(self, op: str, args: tuple[Node, ...], value: float | str) -> Node:
         # By its text, in which 0.0 differs from -0.0, and one NaN does not from another.
         key = (op, tuple(each.index for each in args), repr(value))
         if key not in self._known:

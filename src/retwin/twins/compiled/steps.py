@@ -111,7 +111,7 @@ class Steps:
         process = np.broadcast_to(process, (*shape, states))
         if library is None:
             given = (process, measured, changes, spread)
-            return self._filtered(commands, theta, given, common, first)
+            return self._filter(commands, theta, given, common, first)
         after = np.array(spread, np.float64)
         made = tuple(
             np.empty((*shape, *each)) for each in ((outputs,), (outputs, outputs), (states,))
@@ -124,7 +124,7 @@ class Steps:
         call(library, "filter", (*shape, self.substeps), self.period, shared, rows)
         return made[0], made[1], made[2], after
 
-    def _filtered(
+    def _filter(
         self,
         commands: NDArray,
         theta: NDArray,
@@ -138,13 +138,13 @@ class Steps:
         if changes is None:
             changes = np.zeros((*c.shape[:2], len(self.model.variables["p"])))
         rows = [
-            self._filtered_row(*(_double(each) for each in row), *map(_double, common))
+            self._filter_row(*(_double(each) for each in row), *map(_double, common))
             for row in zip(c, theta, process, *measured, changes, spread, strict=True)
         ]
         mean, covariance, states, after = (np.stack(each) for each in zip(*rows, strict=True))
         return mean, covariance, states, after
 
-    def _filtered_row(
+    def _filter_row(
         self,
         c: Tensor,
         theta: Tensor,
@@ -157,7 +157,7 @@ class Steps:
         gate: Tensor,
     ) -> list[NDArray]:
         """See `filter`, for one trajectory."""
-        constant, start = self._parted(theta[:, None].unbind(0))
+        constant, start = self._split(theta[:, None].unbind(0))
         x = torch.cat(list(start))
         made = []
         for t, (y, known) in enumerate(zip(outputs, seen > 0, strict=True)):
@@ -168,7 +168,7 @@ class Steps:
                 return torch.cat(self.model.evaluate("outputs", z[:, None].unbind(0), u, p))
 
             def after(z: Tensor, t: int = t, p: Sequence[Tensor] = now) -> Tensor:
-                return torch.cat(self._advanced(c[None, t], list(z[:, None].unbind(0)), p))
+                return torch.cat(self._advance(c[None, t], list(z[:, None].unbind(0)), p))
 
             slope = torch.autograd.functional.jacobian(output, x)
             factor = _factor(spread)
@@ -224,7 +224,7 @@ class Steps:
     ) -> tuple[Tensor, Tensor]:
         """The same as `run` for double tensors, with gradient by both."""
         c = self.coefficients(commands, theta, first)
-        p, start = self._parted(theta.unbind(1))
+        p, start = self._split(theta.unbind(1))
         constant = p
         x, outputs, states = list(start), [], []
         for t in range(c.shape[1]):
@@ -236,7 +236,7 @@ class Steps:
             )
             states.append(torch.stack(x, 1))
             if t + 1 < c.shape[1]:
-                x = self._advanced(c[:, t], x, p)
+                x = self._advance(c[:, t], x, p)
             if kicks is not None:
                 x = [own + kick for own, kick in zip(x, _double(kicks[:, t].T), strict=True)]
         return torch.stack(outputs, 1), torch.stack(states, 1)
@@ -258,7 +258,7 @@ class Steps:
             made[..., place] += theta[:, parameter, None] * moved[..., k]
         return made
 
-    def _advanced(self, c: Tensor, x: list[Tensor], p: Sequence[Tensor]) -> list[Tensor]:
+    def _advance(self, c: Tensor, x: list[Tensor], p: Sequence[Tensor]) -> list[Tensor]:
         """The states one sample later."""
         if self.model.discrete:
             return self.model.evaluate("slope", x, c[:, 0].unbind(1), p)
@@ -280,7 +280,7 @@ class Steps:
     def _arrays(self, commands: NDArray, theta: NDArray, first: int = 0) -> list[NDArray]:
         """Coefficients of the commands, parameters and starts, as the compiled model takes them."""
         c = self.coefficients(_double(commands), _double(theta), first).numpy()
-        columns = self._parted(list(theta.T))
+        columns = self._split(list(theta.T))
         starts = [np.stack(own, 1) if own else np.zeros((len(theta), 0)) for own in columns]
         return [np.ascontiguousarray(each, np.float64) for each in (c, *starts)]
 
@@ -289,7 +289,7 @@ class Steps:
         """Numbers of outputs and of states."""
         return len(self.model.outputs), len(self.model.slope)
 
-    def _parted(self, columns: Sequence) -> tuple[Sequence, Sequence]:
+    def _split(self, columns: Sequence) -> tuple[Sequence, Sequence]:
         """What belongs to the parameters, and to the starts."""
         count = len(self.model.variables["p"])
         return columns[:count], columns[count:]

@@ -25,12 +25,12 @@ ELEMENTWISE: dict[str, Callable[..., Node]] = {
     "rsqrt": lambda a: a.program.node("div", 1.0, a.program.node("sqrt", a)),
     "sigmoid": lambda a: _sigmoid(a),
     "silu": lambda a: a * _sigmoid(a),
-    "relu": lambda a: _larger(a, a.program.constant(0.0)),
+    "relu": lambda a: _extreme("ge", a, a.program.constant(0.0)),
     "abs": lambda a: _where("lt", a, 0.0, a.program.node("neg", a), a),
     "sign": lambda a: _where("gt", a, 0.0, 1.0, _where("lt", a, 0.0, -1.0, a)),
     "sgn": lambda a: ELEMENTWISE["sign"](a),
-    "maximum": lambda a, b: _larger(a, b),
-    "minimum": lambda a, b: _smaller(a, b),
+    "maximum": lambda a, b: _extreme("ge", a, b),
+    "minimum": lambda a, b: _extreme("le", a, b),
     "bitwise_not": lambda a: a.program.node("logical_not", a),
     "bitwise_and": lambda a, b: a.program.node("logical_and", a, b),
     "bitwise_or": lambda a, b: a.program.node("logical_or", a, b),
@@ -135,7 +135,7 @@ class _Traced(Tensor):
         return made
 
     def __array__(self, dtype: Any = None) -> NDArray:
-        raise _RefusedError(_described("item"))
+        raise _RefusedError(_describe("item"))
 
     @classmethod
     def __torch_dispatch__(  # type: ignore[override]  # declared by torch as the default's own
@@ -145,16 +145,16 @@ class _Traced(Tensor):
         name, options = function.overloadpacket.__name__, dict(kwargs or {})
         program = next(each.nodes.flat[0].program for each in _flat(args) if type(each) is cls)
         if name in ("clamp", "clamp_min", "clamp_max"):
-            return _clamped(name, *args, **options)
+            return _clamp(name, *args, **options)
         if name in ("add", "sub", "rsub") and options.pop("alpha", 1) != 1:
             raise _RefusedError(f"torch.{name} with alpha")
         if name == "rsub":
             name, args = "sub", args[1::-1]
         if name == "_to_copy":
-            return _converted(args[0], program, options.get("dtype", args[0].dtype))
+            return _convert(args[0], program, options.get("dtype", args[0].dtype))
         inexact = any(each is not None for each in options.values()) and name != "sum"
         if inexact or (name not in ELEMENTWISE and name not in SHAPES):
-            raise _RefusedError(_described(name))
+            raise _RefusedError(_describe(name))
         arrays = [_arrays(program, each) for each in args]
         truth = name in COMPARISONS or name.startswith("bitwise_")
         if name in SHAPES:
@@ -205,7 +205,7 @@ def _flat(args: Any) -> list[Any]:
     return [each for arg in args for each in (arg if isinstance(arg, list | tuple) else (arg,))]
 
 
-def _described(name: str) -> str:
+def _describe(name: str) -> str:
     if name in ("_local_scalar_dense", "detach", "is_nonzero", "item"):
         return "a number taken out of a tensor, by if, float, math or numpy"
     return f"torch.{name.removesuffix('_')}{' in place' if name.endswith('_') else ''}"
@@ -220,7 +220,7 @@ def _kept(a: NDArray, shape: Sequence[int], i: int) -> int:
     return a.shape[i - len(shape) + a.ndim] if shape[i] == -1 else shape[i]
 
 
-def _converted(value: _Traced, program: Program, dtype: torch.dtype) -> _Traced:
+def _convert(value: _Traced, program: Program, dtype: torch.dtype) -> _Traced:
     """A copy of another type: truth values become 0 and 1."""
     if dtype is value.dtype:
         return value
@@ -230,7 +230,7 @@ def _converted(value: _Traced, program: Program, dtype: torch.dtype) -> _Traced:
     return _Traced(_array(made))
 
 
-def _clamped(name: str, value: _Traced, low: Any = None, high: Any = None, **named: Any) -> _Traced:
+def _clamp(name: str, value: _Traced, low: Any = None, high: Any = None, **named: Any) -> _Traced:
     low, high = named.get("min", low), named.get("max", high)
     if name == "clamp_max":
         low, high = None, named.get("max", low)
@@ -246,15 +246,10 @@ def _where(comparison: str, a: Node, b: Node | float, yes: Node | float, no: Nod
     return n("where", n(comparison, a, b), yes, no)
 
 
-def _larger(a: Node, b: Node) -> Node:
-    """The larger of two; NaN if one of them is, as in torch and unlike fmax."""
+def _extreme(comparison: str, a: Node, b: Node) -> Node:
+    """The larger ("ge") or smaller ("le") of two; NaN if one is, as in torch and unlike fmax."""
     n = a.program.node
-    return n("where", n("logical_or", n("ge", a, b), n("ne", a, a)), a, b)
-
-
-def _smaller(a: Node, b: Node) -> Node:
-    n = a.program.node
-    return n("where", n("logical_or", n("le", a, b), n("ne", a, a)), a, b)
+    return n("where", n("logical_or", n(comparison, a, b), n("ne", a, a)), a, b)
 
 
 def _sigmoid(a: Node) -> Node:

@@ -40,7 +40,7 @@ def equations_of(twin: Any) -> dict[str, Any]:
         "rate": twin.rate,
         "substeps": twin.substeps,
         "interpolation": twin.interpolation,
-        "limits": None if twin.limits is None else _bounded(twin.limits),
+        "limits": None if twin.limits is None else _write_limits(twin.limits),
         "delays": twin.delays,
         "learned": twin.learned,
     }
@@ -104,7 +104,7 @@ def equations_from(kind: type[Kind], about: dict[str, Any]) -> Kind:
         parameters=parameters,
         substeps=about["substeps"],
         interpolation=about["interpolation"],
-        limits=None if about["limits"] is None else _limits(**about["limits"]),
+        limits=None if about["limits"] is None else _read_limits(**about["limits"]),
         delays=about.get("delays", {}),
         learned=one_of("learned", about.get("learned", False), (True, False)),
     )
@@ -113,7 +113,7 @@ def equations_from(kind: type[Kind], about: dict[str, Any]) -> Kind:
     return twin
 
 
-def _bounded(limits: Limits) -> dict[str, Any]:
+def _write_limits(limits: Limits) -> dict[str, Any]:
     """Limits as JSON, which has no infinity."""
     low, high = (
         [each if isfinite(each) else None for each in s] for s in (limits.low, limits.high)
@@ -121,7 +121,7 @@ def _bounded(limits: Limits) -> dict[str, Any]:
     return {"low": low, "high": high, "outside": limits.outside}
 
 
-def _limits(low: list, high: list, outside: Any) -> Limits:
+def _read_limits(low: list, high: list, outside: Any) -> Limits:
     return Limits(
         tuple(-inf if each is None else each for each in low),
         tuple(inf if each is None else each for each in high),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.twins.fmu.access import Access
-from retwin.twins.fmu.model import find_scalars
+from retwin.twins.fmu.model import NUMBERS, find_scalars
 from retwin.workers.process import Retired, more_time
 
 MAX_INSTANCES = 500
@@ -319,7 +319,8 @@ class Instance:
             if scalar.name in self.job.rates:
                 ratio = self.job.rate / self.job.rates[scalar.name]
                 at = np.floor(points / ratio + ROUNDING) * ratio
-            if not _is_continuous(scalar.variable):
+            kind = scalar.variable
+            if kind.type not in NUMBERS or kind.variability != "continuous":
                 at = np.floor(at + ROUNDING)
             table[:, column] = np.interp(at, samples, commands[:, column])
         return table
@@ -336,20 +337,3 @@ def _refusing_negative(call: Callable[..., Any]) -> Callable[..., Any]:
         return status
 
     return checked
-
-
-def _is_continuous(variable: Any) -> bool:
-    """Whether a variable is interpolated between its samples.
-
-    Parameters
-    ----------
-    variable : fmpy.model_description.ModelVariable
-        An input.
-
-    Returns
-    -------
-    bool
-        True for continuous floating-point variables.
-
-    """
-    return variable.type in ("Real", "Float32", "Float64") and variable.variability == "continuous"

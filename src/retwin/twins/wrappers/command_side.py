@@ -78,7 +78,7 @@ class CommandSide(TwinWrapper):
             options = {name: each[chunk.index] for name, each in inner_values.items()}
             late = delay[chunk.index, None] * self.rate
             delayed = interpolated(chunk.faulty_commands, np.arange(commands.shape[1]) - late)
-            effective = self._clipped(delayed + offset[chunk.index][:, None])
+            effective = self._clip(delayed + offset[chunk.index][:, None])
             responses: list[Fault | None] = [
                 None if fault is None else _ResponseOnly(fault) for fault in chunk.faults
             ]
@@ -96,7 +96,7 @@ class CommandSide(TwinWrapper):
             self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )
 
-    def _clipped(self, commands: NDArray) -> NDArray:
+    def _clip(self, commands: NDArray) -> NDArray:
         """Commands (n, T, d_u) within the twin's limits: an actuator goes no further."""
         if self.limits is None:
             return commands

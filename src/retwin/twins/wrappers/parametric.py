@@ -111,6 +111,10 @@ class Parameter:
         object.__setattr__(self, "start", float(start))
         object.__setattr__(self, "places", dict(self.places or {self.name: 1.0}))
 
+    def with_start(self, value: float) -> Parameter:
+        """The same parameter at another start, by which its bounds are widened if it is outside."""
+        return replace(self, start=value, low=min(self.low, value), high=max(self.high, value))
+
 
 @dataclass(frozen=True)
 class ParametricTwin(TwinWrapper):

@@ -50,12 +50,11 @@ class Arrow:
     @property
     def unit(self) -> NDArray:
         """Units (k + n m,) of the unknowns in which the diagonal is 1."""
-        made: NDArray = 1 / np.sqrt(np.maximum(self.diagonal, 1e-300))
-        return made
+        return 1 / np.sqrt(np.maximum(self.diagonal, 1e-300))
 
     def plus(self, diagonal: NDArray) -> Arrow:
         """The sum with a diagonal matrix (k + n m,)."""
-        shared, own = self._parted(diagonal)
+        shared, own = self._split(diagonal)
         return Arrow(
             self.shared + np.diag(shared),
             self.cross,
@@ -64,7 +63,7 @@ class Arrow:
 
     def scaled(self, unit: NDArray) -> Arrow:
         """The matrix for unknowns in such units (k + n m,)."""
-        shared, own = self._parted(unit)
+        shared, own = self._split(unit)
         return Arrow(
             shared[:, None] * self.shared * shared,
             own[..., None] * self.cross * shared,
@@ -91,19 +90,19 @@ class Arrow:
     def solve(self, right: NDArray) -> NDArray:
         """The solution (k + n m,) of linear equations."""
         complement, follow, inverse = self.reduced()
-        shared, own = self._parted(right)
+        shared, own = self._split(right)
         x = np.linalg.solve(complement, shared - np.einsum("nmk,nm->k", follow, own))
         y = np.einsum("nij,nj->ni", inverse, own) - follow @ x
         return np.concatenate([x, y.ravel()])
 
     def times(self, vector: NDArray) -> NDArray:
         """The product (k + n m,) with a vector."""
-        shared, own = self._parted(vector)
+        shared, own = self._split(vector)
         x = self.shared @ shared + np.einsum("nmk,nm->k", self.cross, own)
         y = self.cross @ shared + np.einsum("nij,nj->ni", self.own, own)
         return np.concatenate([x, y.ravel()])
 
-    def _parted(self, vector: NDArray) -> tuple[NDArray, NDArray]:
+    def _split(self, vector: NDArray) -> tuple[NDArray, NDArray]:
         """The shared part (k,) and that of the trajectories (n, m)."""
         k = len(self.shared)
         return vector[:k], vector[k:].reshape(self.own.shape[:2])

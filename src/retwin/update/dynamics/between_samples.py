@@ -79,13 +79,13 @@ def chosen(
     visited = held.simulated(fitted.point)[1]
     far = edges(visited, held.commands, settings.folds)
 
-    def reported(done: float) -> None:
+    def report(done: float) -> None:
         progress(0.05 + share * done)
 
-    tried = searched(held, fitted.point, settings, visited, parts, far, reported)
+    tried = searched(held, fitted.point, settings, visited, parts, far, report)
     best = (held, fitted, best_of(tried))
     for other in others:
-        if not any(_shown(each, other, parts) for each in tried):
+        if not any(_is_shown(each, other, parts) for each in tried):
             continue
         try:
             own, at = without_discrepancy(replace(base, interpolation=other), observed, unknowns)
@@ -98,7 +98,7 @@ def chosen(
     return best
 
 
-def _shown(candidate: Candidate, other: str, parts: Sequence[NDArray]) -> bool:
+def _is_shown(candidate: Candidate, other: str, parts: Sequence[NDArray]) -> bool:
     """Whether the errors of a candidate are in the direction of another interpolation.
 
     That is its effect on the outputs, without what the unknowns can do instead: the errors are
@@ -109,7 +109,7 @@ def _shown(candidate: Candidate, other: str, parts: Sequence[NDArray]) -> bool:
     effect = found.residual - changed.residual(found.point)
     if not (found.finite and np.isfinite(effect).all()):
         return False
-    effect = _unexplained(candidate, effect) / np.sqrt(estimation.variance)
+    effect = _subtract_explained(candidate, effect) / np.sqrt(estimation.variance)
     residual = found.residual / np.sqrt(estimation.variance)
     products = np.array(
         [[np.sum(effect[part] * each[part]) for part in parts] for each in (residual, effect)]
@@ -121,7 +121,7 @@ def _shown(candidate: Candidate, other: str, parts: Sequence[NDArray]) -> bool:
     return bool(share > EVIDENT * np.sqrt(np.sum((along - share * size) ** 2)) / size.sum())
 
 
-def _unexplained(candidate: Candidate, effect: NDArray) -> NDArray:
+def _subtract_explained(candidate: Candidate, effect: NDArray) -> NDArray:
     """An effect (n, T, d_y) on the outputs without what the shared unknowns can do, linearly."""
     estimation, found = candidate.estimation, candidate.found
     matrix, k = estimation.unknowns.matrix, estimation.unknowns.count

@@ -153,12 +153,12 @@ def searched(
     """
     tried: list[Candidate] = []
     for number, equations in enumerate(_forms(alone, point, settings, visited)):
-        own, found = _followed(equations, None, alone, point, STRONGEST)
+        own, found = _follow(equations, None, alone, point, STRONGEST)
         tried.append(Candidate.tested(equations, None, own, found, parts, far))
         if settings.remembers(equations.form):
             slow = _memory(equations, alone, own, found)
             strength = float(np.mean(own.variance / alone.variance))
-            own, found = _followed(equations, slow, alone, found.point, strength)
+            own, found = _follow(equations, slow, alone, found.point, strength)
             tried.append(Candidate.tested(equations, slow, own, found, parts, far))
         progress(1 - 0.6 ** (number + 1))
     return tried
@@ -188,11 +188,8 @@ def better(candidate: Candidate, other: Candidate) -> bool:
 def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin:
     """The twin whose parameters start at a point."""
     values = unknowns.offset + unknowns.matrix @ point.shared
-    parameters = (
-        replace(each, start=value, low=min(each.low, value), high=max(each.high, value))
-        for each, value in zip(base.parameters, values.tolist(), strict=True)
-    )
-    return replace(base, parameters=tuple(parameters))
+    pairs = zip(base.parameters, values.tolist(), strict=True)
+    return replace(base, parameters=tuple(each.with_start(value) for each, value in pairs))
 
 
 def _forms(
@@ -266,7 +263,7 @@ def _memory(
     return max(gains, key=lambda memory: gains[memory])
 
 
-def _followed(
+def _follow(
     equations: CorrectedEquations,
     memory: Memory | None,
     alone: Estimation,

@@ -247,7 +247,7 @@ class CorrectedEquations:
     def discrepancies(self, variables: Sequence[Any], coefficients: Sequence[Any]) -> list[Any]:
         """Per equation, the discrepancy over the speed of its state, at scaled variables."""
         made = []
-        for equation, weights, inner in self._parted(coefficients):
+        for equation, weights, inner in self._split(coefficients):
             values = equation.values(variables, inner)
             made.append(sum(own * each for own, each in zip(weights, values, strict=True)))
         return made
@@ -262,13 +262,13 @@ class CorrectedEquations:
         scaled = self._scaled(states, commands)
         starts = [each.start for each in self.coefficients]
         columns = []
-        for equation, _, inner in self._parted(starts if coefficients is None else coefficients):
+        for equation, _, inner in self._split(starts if coefficients is None else coefficients):
             columns += equation.values(scaled, inner)
         zero = 0.0 * scaled[0]
         made: NDArray = np.stack([(zero + each).numpy() for each in columns] or [[]] * len(zero), 1)
         return made.reshape(len(zero), -1)
 
-    def _parted(self, coefficients: Iterable[Any]) -> Iterator[tuple[Equation, list, list[list]]]:
+    def _split(self, coefficients: Iterable[Any]) -> Iterator[tuple[Equation, list, list[list]]]:
         """Per equation, the weights of its terms, and the inner coefficients of each."""
         left = iter(coefficients)
         for equation in self.equations:
@@ -278,7 +278,7 @@ class CorrectedEquations:
     @property
     def weights(self) -> NDArray:
         """The places (t,) of the weights among the coefficients."""
-        found = self._parted(range(len(self.coefficients)))
+        found = self._split(range(len(self.coefficients)))
         return np.array([each for _, own, _ in found for each in own], dtype=int)
 
     def absorbed(self, coefficients: NDArray) -> tuple[NDArray, NDArray]:
@@ -344,15 +344,13 @@ def _by_parameters(twin: StateTwin, equation: int, states: NDArray, commands: ND
         return np.zeros((len(states), len(p)))
     found = torch.autograd.grad(slope.sum(), p, allow_unused=True)
     zero = torch.zeros_like(x[0])
-    made: NDArray = torch.stack([zero if each is None else each for each in found], 1).numpy()
-    return made
+    return torch.stack([zero if each is None else each for each in found], 1).numpy()
 
 
 def _scaled(columns: NDArray) -> NDArray:
     """Columns of norm 1, without those that are 0."""
     size = np.linalg.norm(columns, axis=0)
-    made: NDArray = np.divide(columns, size, out=np.zeros_like(columns), where=size > 0)
-    return made
+    return np.divide(columns, size, out=np.zeros_like(columns), where=size > 0)
 
 
 def variable_names(twin: StateTwin) -> list[str]:

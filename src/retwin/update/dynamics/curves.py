@@ -52,8 +52,7 @@ class Curve:
     @property
     def inside(self) -> NDArray:
         """Whether each value is in the domain (K,)."""
-        made: NDArray = (self.low <= self.values) & (self.values <= self.high)
-        return made
+        return (self.low <= self.values) & (self.values <= self.high)
 
     def band(self, level: float = 0.9) -> tuple[NDArray, NDArray]:
         """Ends (K,) of the central interval of that probability, at each value by itself."""

@@ -85,5 +85,4 @@ class Domain:
             return np.zeros(len(self.low))
         both = np.concatenate([states[finite], commands[finite]], axis=2)
         beyond = np.maximum(both.max(axis=(0, 1)) - self.high, self.low - both.min(axis=(0, 1)))
-        made: NDArray = np.maximum(beyond, 0.0) / self.width
-        return made
+        return np.maximum(beyond, 0.0) / self.width

@@ -159,16 +159,12 @@ class Estimation:
         square = np.nanmean(values**2, axis=(0, 1))
         variance = np.nanvar(values, axis=(0, 1))
         constant = np.where(square > 0, square, 1.0)
-        made: NDArray = np.where(variance > RESOLUTION * square, variance, constant)
-        return made
+        return np.where(variance > RESOLUTION * square, variance, constant)
 
     def power(self, residual: NDArray, seen: NDArray | None = None) -> NDArray:
         """Mean squares (d_y,), above 0, of a residual (n, T, d_y) that is 0 where not `seen`."""
         count = np.maximum((self.seen if seen is None else seen).sum(axis=(0, 1)), 1)
-        made: NDArray = np.maximum(
-            np.sum(residual**2, axis=(0, 1)) / count, RESOLUTION * self.spread
-        )
-        return made
+        return np.maximum(np.sum(residual**2, axis=(0, 1)) / count, RESOLUTION * self.spread)
 
     def rms(self, residual: NDArray, part: NDArray | None = None) -> float:
         """Root mean square of a residual, relative where the outputs have several units.
@@ -189,7 +185,7 @@ class Estimation:
         flat = at.point.flat
         if not flat.size:
             return at
-        value, gradient, curvature = self._expanded(at)
+        value, gradient, curvature = self._expand(at)
         unit = curvature.unit
         radius, idle = WIDEST / 1e3, 0
         for _ in range(steps):
@@ -204,7 +200,7 @@ class Estimation:
                 break
             inside = np.clip(flat + unit * step, *self.bounds)
             tried = self.linearised(self.point(inside))
-            found = self._expanded(tried)
+            found = self._expand(tried)
             ratio = (value - found[0]) / expected
             if ratio < 0.25:
                 radius = length / 4
@@ -219,19 +215,19 @@ class Estimation:
 
     def rest(self, at: Linearised) -> float:
         """The objective in nats that a Gauss-Newton step from a point would leave."""
-        return self._expanded(at)[0] - self.gain(at) if at.finite else np.inf
+        return self._expand(at)[0] - self.gain(at) if at.finite else np.inf
 
     def gain(self, at: Linearised) -> float:
         """The decrease of the objective, in nats, by a Gauss-Newton step from a point."""
         if not at.finite:
             return -np.inf
-        _, gradient, curvature = self._expanded(at)
+        _, gradient, curvature = self._expand(at)
         unit = curvature.unit
         scaled = curvature.scaled(unit)
         step = trust_region_step(scaled, unit * gradient, WIDEST)
         return -float(step @ (unit * gradient + scaled.times(step) / 2))
 
-    def _expanded(self, at: Linearised) -> tuple[float, NDArray, Arrow]:
+    def _expand(self, at: Linearised) -> tuple[float, NDArray, Arrow]:
         """The objective at a point, its gradient (k + n m,) and Gauss-Newton curvature.
 
         A coordinate at its bound is held where the objective would take it further. Where the
@@ -268,8 +264,7 @@ class Estimation:
     def _pressed(self, flat: NDArray, gradient: NDArray) -> NDArray:
         """Which coordinates (k + n m,) are at a bound beyond which the objective falls."""
         low, high = self.bounds
-        made: NDArray = ((flat <= low) & (gradient > 0)) | ((flat >= high) & (gradient < 0))
-        return made
+        return ((flat <= low) & (gradient > 0)) | ((flat >= high) & (gradient < 0))
 
     def _curvature(self, at: Linearised) -> Arrow:
         """The Gauss-Newton curvature of the objective."""
@@ -318,8 +313,7 @@ class Estimation:
         curvature = self._curvature(at)
         values, directions = np.linalg.eigh(curvature.scaled(curvature.unit).reduced()[0])
         free = np.abs(directions[:, values <= RESOLUTION * len(values)])
-        made: NDArray = (free > np.sqrt(RESOLUTION)).any(axis=1)
-        return made
+        return (free > np.sqrt(RESOLUTION)).any(axis=1)
 
     def confounded(self, at: Linearised) -> NDArray:
         """Combinations (r, k) of shared coordinates, each of which acts, that act together on none.
@@ -360,8 +354,7 @@ class Estimation:
 def root(covariance: NDArray) -> NDArray:
     """A matrix whose product with its transpose is a covariance."""
     values, directions = np.linalg.eigh(covariance)
-    made: NDArray = directions * np.sqrt(np.maximum(values, 0.0))
-    return made
+    return directions * np.sqrt(np.maximum(values, 0.0))
 
 
 def correlation_time(residual: NDArray) -> float:

@@ -90,10 +90,7 @@ class DynamicsFilter:
         They are central differences along the columns of `factor`, in posterior deviations; 0 where
         these are not finite.
         """
-        moves = STEP * self.factor.T
-        if not known_start:
-            moves[:, -len(self.process) :] = 0.0
-        moves = moves[moves.any(axis=1)]
+        moves = STEP * self.directions(known_start=known_start)
         made = np.zeros((*measured.shape, len(moves)))
         size = max(1, SAMPLES_PER_CHUNK // (2 * measured[..., 0].size))
         for first in range(0, len(moves), size):
@@ -104,6 +101,13 @@ class DynamicsFilter:
             up, down = mean.reshape(2, len(own), *measured.shape)
             made[..., first : first + size] = np.moveaxis((up - down) / (2 * STEP), 0, -1)
         return np.where(np.isfinite(made), made, 0.0)
+
+    def directions(self, *, known_start: bool) -> NDArray:
+        """Posterior deviations (r, q + d_x) of `values`; of a running system without starts."""
+        moves = self.factor.T.copy()
+        if not known_start:
+            moves[:, -len(self.process) :] = 0.0
+        return moves[moves.any(axis=1)]
 
     def start(self, count: int, *, known_start: bool) -> tuple[NDArray, NDArray]:
         """What the filter knows of `count` trajectories before their first sample.
@@ -132,5 +136,4 @@ class DynamicsFilter:
         largest = self.domain.high[:count] - self.domain.low[:count]
         with np.errstate(invalid="ignore"):
             change = np.abs(np.diff(states, axis=1, append=states[:, -1:]))
-        made: NDArray = self.process + self.proportional * np.fmin(change, largest) ** 2
-        return made
+        return self.process + self.proportional * np.fmin(change, largest) ** 2

@@ -223,8 +223,7 @@ class Record:
         """Cubic polynomials (J, T, 4, d_u) of commands (J, T, d_u) between samples."""
         given = torch.tensor(commands, dtype=torch.float64)
         theta = torch.tensor(np.tile(self._theta, (len(commands), 1)))
-        made: NDArray = self.twin.equations.steps().coefficients(given, theta).numpy()
-        return made
+        return self.twin.equations.steps().coefficients(given, theta).numpy()
 
 
 @lru_cache(maxsize=COMPILED)

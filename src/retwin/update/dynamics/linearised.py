@@ -88,5 +88,4 @@ class HeldOut:
         They hold for errors that are correlated in any way within a part.
         """
         count = len(self.moves)
-        made: NDArray = (count - 1) * np.var(self.moves, axis=0)
-        return made
+        return (count - 1) * np.var(self.moves, axis=0)

@@ -35,8 +35,7 @@ RATIO = 4.0
 def times_tried(samples: int, rate: float) -> NDArray:
     """Time constants in s up to a record of so many samples."""
     count = int(np.log(max(samples / SHORTEST, 1.0)) / np.log(RATIO)) + 1
-    made: NDArray = SHORTEST * RATIO ** np.arange(count) / rate
-    return made
+    return SHORTEST * RATIO ** np.arange(count) / rate
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ def fit_noise(
     # A linear step to the parameters without a part may lead where the equations diverge.
     usual = noisy(twin, indices, np.zeros(len(indices) + len(twin.noise)))
     finite = [
-        np.isfinite(_predicted(usual, observed, [part], move[None]).mean[part]).all()
+        np.isfinite(_predict(usual, observed, [part], move[None]).mean[part]).all()
         for part, move in zip(parts, moves, strict=True)
     ]
     kept = np.where(np.array(finite)[:, None], moves, 0.0)
@@ -73,7 +73,7 @@ def fit_noise(
     def scaled(logs: NDArray) -> DynamicsTwin:
         # A common scale changes no prediction, but all intervals.
         made = noisy(twin, indices, logs)
-        error = np.abs(_predicted(made, observed, parts, kept).standardised())
+        error = np.abs(_predict(made, observed, parts, kept).standardised())
         scale = (np.nanquantile(error, LEVEL) / ndtri((1 + LEVEL) / 2)) ** 2
         return replace(
             made,
@@ -83,16 +83,16 @@ def fit_noise(
             noise=np.maximum(scale * made.noise, SMALLEST**2 * twin.noise),
         )
 
-    found = search.visited()
+    found = search.visit()
     made = scaled(found.best)
     if 0.5 ** len(parts) < CHANCE:  # fewer parts cannot show it
-        more = search.visited(found.best)
+        more = search.visit(found.best)
         if more.decided(found):
             return replace(scaled(more.best), free_process=made.free_process)
     return made
 
 
-def _predicted(
+def _predict(
     twin: DynamicsTwin, observed: Trajectories, parts: Sequence[NDArray], moves: NDArray
 ) -> Prediction:
     """One-step predictions of each part with the parameters that are estimated without it."""

@@ -24,36 +24,56 @@ from retwin.update.dynamics.twin import DynamicsTwin
 
 __all__ = ["CHANCE", "SMALLEST", "Search", "Visited", "noisy"]
 
-LOWEST = (1e-4, 1e-2, 1e-3)
-"""Lowest deviations with which the search begins: of process noise over the usual step of a sample,
-of measurement noise over the error of free simulation, of process noise over the present change.
-The highest ones are 1."""
 SMALLEST = 1e-6
-"""Lowest of these ratios, and the reciprocal of the highest."""
-DRAWN = 8
-"""Number of points per dimension among which the search begins."""
-CLIMBS = ((6, 3), (3, 20))
-"""Rounds of scoring: the number of points from which it climbs, and of steps at most."""
-SIMPLEX = (12, 0.3)
-"""The simplex around the maximum: calls per dimension at most, and its size."""
-ROUGH = 0.5
-"""Log likelihood that it finds beyond a maximum from which on the likelihood is not smooth."""
-DESCENTS = ((8, 15, 1.0), (3, 60, 0.5))
-"""Rounds of simplices where it is not: the number of points, calls per dimension at most, and the
-size of the first steps."""
-DIFFERENCE = 1e-3
-"""Step of the differences by which derivatives are computed."""
-LONGEST = 2.0
-"""Longest step of a coordinate."""
-TRIES = 5
-"""Steps of scoring that are tried, each shorter than the one before, until one is better."""
-CLOSE = 0.01
-"""Log likelihood that a step is expected to gain, below which a maximum is reached."""
+"""Lowest ratio of a deviation to its usual one (`noisy`), and the reciprocal of the highest."""
 IMPOSSIBLE = 1e100
 """Cost where the filter is not finite."""
 CHANCE = 0.05
 """Probability of the gain of held-out parts, if it were chance, below which noise in proportion to
 the change is taken."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchSettings:
+    """Settings of the search for the noise; lengths are those of logarithms of deviations.
+
+    Attributes
+    ----------
+    lowest : (float, float, float)
+        Lowest deviations with which the search begins, over the usual ones (`noisy`): of process
+        noise, of measurement noise, and of noise in proportion. The highest ones are 1.
+    points : int
+        Number of points per dimension among which the search begins.
+    climbs : tuple of (int, int)
+        Rounds of scoring: the number of points from which it climbs, and of steps at most.
+    difference : float
+        Step of the differences by which derivatives are computed.
+    longest : float
+        Longest step of a coordinate.
+    tries : int
+        Steps of scoring that are tried, each shorter than the one before, until one is better.
+    close : float
+        Log likelihood that a step is expected to gain, below which a maximum is reached.
+    simplex : (int, float)
+        The simplex around the maximum: calls per dimension at most, and its size.
+    rough : float
+        Log likelihood that it gains beyond a maximum from which on the likelihood is not smooth.
+    descents : tuple of (int, int, float)
+        Rounds of simplices where it is not: the number of points, calls per dimension at most, and
+        the size of the first steps.
+
+    """
+
+    lowest: tuple[float, float, float] = (1e-4, 1e-2, 1e-3)
+    points: int = 8
+    climbs: tuple[tuple[int, int], ...] = ((6, 3), (3, 20))
+    difference: float = 1e-3
+    longest: float = 2.0
+    tries: int = 5
+    close: float = 0.01
+    simplex: tuple[int, float] = (12, 0.3)
+    rough: float = 0.5
+    descents: tuple[tuple[int, int, float], ...] = ((8, 15, 1.0), (3, 60, 0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +86,7 @@ class Visited:
     @property
     def best(self) -> NDArray:
         """The point (w,) with the highest likelihood."""
-        made: NDArray = self.points[self.scores.sum(axis=1).argmax()]
-        return made
+        return self.points[self.scores.sum(axis=1).argmax()]
 
     @property
     def held_out(self) -> NDArray:
@@ -93,8 +112,9 @@ class Search:
     indices: NDArray
     parts: Sequence[NDArray]
     moves: NDArray
+    settings: SearchSettings = SearchSettings()
 
-    def predicted(self, logs: NDArray) -> tuple[Prediction, NDArray]:
+    def predict(self, logs: NDArray) -> tuple[Prediction, NDArray]:
         """One-step predictions, and log densities (K,) of the parts.
 
         One pass over the record has the parameters of each part in turn. Only the states at the
@@ -113,8 +133,7 @@ class Search:
     @cached_property
     def counted(self) -> NDArray:
         """Samples (n, T) of the parts."""
-        made: NDArray = np.any(np.stack(list(self.parts)), axis=0)
-        return made
+        return np.any(np.stack(list(self.parts)), axis=0)
 
     @cached_property
     def _given(self) -> tuple[NDArray, NDArray, NDArray]:
@@ -141,7 +160,7 @@ class Search:
         theta = twin.filter.start(len(commands), known_start=True)[0]
         return twin.equations.steps().run(commands, theta, changes=self._changes)[1]
 
-    def visited(self, constant: NDArray | None = None) -> Visited:
+    def visit(self, constant: NDArray | None = None) -> Visited:
         """All points of a search for the maximum.
 
         Without `constant` the process noise is constant; with it, the best such noise, a part is in
@@ -149,29 +168,29 @@ class Search:
         """
         widths = (len(self.indices), len(self.twin.noise), 1)
         number = sum(widths) if constant is not None else sum(widths[:2])
-        low = np.log(np.repeat(LOWEST, widths))[:number]
+        settings, low = self.settings, np.log(np.repeat(self.settings.lowest, widths))[:number]
         process = np.repeat((True, False, True), widths)[:number]
-        climb = _Climb(self)
-        drawn = list(low * np.random.default_rng(0).random((DRAWN * number, number)))
+        path = _Path(self)
+        drawn = list(low * np.random.default_rng(0).random((settings.points * number, number)))
         if constant is not None:
             drawn.append(np.append(constant, low[len(constant) :]))
         # All noise in the states, and all in the measurements, are often two maxima.
         ends = [np.where(process, 0.0, low), np.where(process, low, 0.0)]
-        tried = ends + sorted(drawn, key=climb.cost)
-        for count, steps in CLIMBS:
-            tried = sorted((climb.climbed(each, steps) for each in tried[:count]), key=climb.cost)
-        best = climb.descended(tried[0], *SIMPLEX)
-        if climb.cost(tried[0]) - climb.cost(best) > ROUGH:
+        tried = ends + sorted(drawn, key=path.cost)
+        for count, steps in settings.climbs:
+            tried = sorted((path.climb(each, steps) for each in tried[:count]), key=path.cost)
+        best = path.descend(tried[0], *settings.simplex)
+        if path.cost(tried[0]) - path.cost(best) > settings.rough:
             tried = [best, *tried, *drawn]
-            for count, calls, size in DESCENTS:
-                nearest = sorted(tried, key=climb.cost)[:count]
-                tried = [climb.descended(each, calls, size) for each in nearest]
-        climb.leave_out(climb.visited.best)
-        return climb.visited
+            for count, calls, size in settings.descents:
+                nearest = sorted(tried, key=path.cost)[:count]
+                tried = [path.descend(each, calls, size) for each in nearest]
+        path.leave_out(path.visited.best)
+        return path.visited
 
 
 @dataclass(frozen=True, eq=False)
-class _Climb:
+class _Path:
     """Ways to a maximum of a search, and all points on them."""
 
     search: Search
@@ -186,7 +205,7 @@ class _Climb:
 
     def at(self, logs: NDArray) -> tuple[Prediction, NDArray]:
         """The predictions at a point, and log densities (K,) of the parts."""
-        prediction, scores = self.search.predicted(logs)
+        prediction, scores = self.search.predict(logs)
         self.scores[logs.tobytes()] = np.array(logs), scores
         return prediction, scores
 
@@ -195,9 +214,9 @@ class _Climb:
         known = self.scores.get(logs.tobytes())
         return -float((self.at(logs)[1] if known is None else known[1]).sum())
 
-    def descended(self, start: NDArray, calls: int, size: float) -> NDArray:
+    def descend(self, start: NDArray, calls: int, size: float) -> NDArray:
         """The best point of a simplex of Nelder and Mead, which needs no derivatives."""
-        found: NDArray = minimize(
+        return minimize(
             self.cost,
             start,
             method="Nelder-Mead",
@@ -209,9 +228,8 @@ class _Climb:
                 "fatol": 0.1,
             },
         ).x
-        return found
 
-    def climbed(self, start: NDArray, steps: int) -> NDArray:
+    def climb(self, start: NDArray, steps: int) -> NDArray:
         """The point after some steps of scoring, each damped until it is better."""
         point, damping = start, 1e-2
         prediction, scores = self.at(start)
@@ -223,12 +241,15 @@ class _Climb:
             edge = -np.log(SMALLEST)
             free = ~(((point <= -edge) & (gradient < 0)) | ((point >= edge) & (gradient > 0)))
             own, slope = information[np.ix_(free, free)], gradient[free]
-            if not free.any() or slope @ np.linalg.solve(own, slope) / 2 < CLOSE:
+            if (
+                not free.any()
+                or slope @ np.linalg.solve(own, slope) / 2 < self.search.settings.close
+            ):
                 break
-            for _ in range(TRIES):
+            for _ in range(self.search.settings.tries):
                 step = np.zeros(len(point))
                 step[free] = np.linalg.solve(own + damping * np.diag(np.diag(own)), slope)
-                step *= min(1.0, LONGEST / np.abs(step).max())
+                step *= min(1.0, self.search.settings.longest / np.abs(step).max())
                 new = np.clip(point + step, -edge, edge)
                 found = self.at(new)
                 if found[1].sum() > scores.sum():
@@ -244,8 +265,8 @@ class _Climb:
         """Visit the maxima (K,) without each part, by a step of scoring from that of all."""
         gradients, information = self._derivatives(point, *self.at(point))
         steps = -np.linalg.solve(information, gradients)
-        edge = -np.log(SMALLEST)
-        for step in np.clip(steps, -LONGEST, LONGEST).T:
+        edge, longest = -np.log(SMALLEST), self.search.settings.longest
+        for step in np.clip(steps, -longest, longest).T:
             self.at(np.clip(point + step, -edge, edge))
 
     def _derivatives(
@@ -260,9 +281,10 @@ class _Climb:
         root = root_of(prediction.covariance, seen)
         both = seen[..., :, None] & seen[..., None, :]
         gradient, rows = np.zeros((len(point), len(scores))), []
+        size = self.search.settings.difference
         for i in range(len(point)):
             step = np.zeros(len(point))
-            step[i] = DIFFERENCE if point[i] + DIFFERENCE <= -np.log(SMALLEST) else -DIFFERENCE
+            step[i] = size if point[i] + size <= -np.log(SMALLEST) else -size
             other, own = self.at(point + step)
             gradient[i] = (own - scores) / step[i]
             mean = whitened(other.mean - prediction.mean, root, seen)

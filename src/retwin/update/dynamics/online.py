@@ -65,18 +65,12 @@ class FilterState:
         return FilterState(*made)
 
 
-def directions(twin: DynamicsTwin) -> NDArray:
-    """Posterior deviations (r, q + d_x) of the parameters of a twin, without those of starts."""
-    moves = twin.factor.T.copy()
-    moves[:, -len(twin.process) :] = 0.0  # a running system may be in any state
-    return moves[moves.any(axis=1)]
-
-
 def moved(twin: DynamicsTwin, centre: Sequence[float]) -> DynamicsTwin:
     """The twin of a system whose parameters are at `centre` (r,), or at () the most probable."""
     if not len(centre):
         return twin
-    return replace(twin, values=twin.values + np.asarray(centre) @ directions(twin))
+    directions = twin.filter.directions(known_start=False)
+    return replace(twin, values=twin.values + np.asarray(centre) @ directions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +96,7 @@ class OnlineFilter:
     @cached_property
     def _moves(self) -> NDArray:
         """What is added to the values of the twin (1 + r, q + d_x); the first row is 0."""
-        moves = STEP * directions(self.twin)
+        moves = STEP * self.twin.filter.directions(known_start=False)
         none = np.zeros((1, moves.shape[1]))
         return np.concatenate([none, moves]) if self.effect else none
 
@@ -150,17 +144,17 @@ class OnlineFilter:
         """
         learn = np.ones(len(commands), dtype=bool) if learn is None else learn
         if self.twin.equations.interpolation != "spline":
-            return self._passed(state, commands, measured, seen, learn)
+            return self._advance(state, commands, measured, seen, learn)
         found = []
         for t in range(commands.shape[1]):  # a later command would change the spline
             part = slice(t, t + 1)
             own = commands[:, part], measured[:, part], seen[:, part]
-            state, *more = self._passed(state, *own, learn)
+            state, *more = self._advance(state, *own, learn)
             found.append(more)
         mean, covariance = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
         return state, mean, covariance
 
-    def _passed(
+    def _advance(
         self,
         state: FilterState,
         commands: NDArray,

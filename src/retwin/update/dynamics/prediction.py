@@ -44,8 +44,7 @@ class Prediction:
     @property
     def deviation(self) -> NDArray:
         """Standard deviations (n, T, d_y)."""
-        made: NDArray = np.sqrt(np.diagonal(self.covariance, axis1=2, axis2=3))
-        return made
+        return np.sqrt(np.diagonal(self.covariance, axis1=2, axis2=3))
 
     def quantile(self, level: ArrayLike) -> NDArray:
         """Quantiles of each output: (..., n, T, d_y) for levels (...)."""
@@ -57,16 +56,14 @@ class Prediction:
             got=level,
             remedy="give 0.95, not 95",
         )
-        made: NDArray = self.mean + ndtri(levels[..., None, None, None]) * self.deviation
-        return made
+        return self.mean + ndtri(levels[..., None, None, None]) * self.deviation
 
     def pit(self) -> NDArray:
         """Probability-integral transforms (n, T, d_y) of the measured outputs; NaN for others.
 
         They are uniform and independent if the distributions are those of the data.
         """
-        made: NDArray = norm.cdf(self.standardised())
-        return made
+        return norm.cdf(self.standardised())
 
     def coverage(self, share: float = 0.9) -> NDArray:
         """Share (d_y,) of the measured samples inside the central interval of that probability.
@@ -77,8 +74,7 @@ class Prediction:
         inside = np.abs(self.standardised()) <= ndtri((1 + share) / 2)
         counted: NDArray = self.record.mask.sum(axis=(0, 1))
         held = (inside & self.record.mask).sum(axis=(0, 1))
-        made: NDArray = np.where(counted > 0, held / np.maximum(counted, 1), np.nan)
-        return made
+        return np.where(counted > 0, held / np.maximum(counted, 1), np.nan)
 
     def whiteness(self) -> list[tuple[Correlogram, float]]:
         """Autocorrelation of the errors of each output, and the p-value of Ljung and Box's test.
@@ -113,8 +109,7 @@ class Prediction:
     def standardised(self) -> NDArray:
         """Errors (n, T, d_y) in standard deviations; NaN where nothing was measured."""
         error = (self.record.observed - self.mean) / self.deviation
-        made: NDArray = np.where(self.record.mask, error, np.nan)
-        return made
+        return np.where(self.record.mask, error, np.nan)
 
 
 @dataclass(eq=False)
@@ -183,8 +178,7 @@ def log_density(error: NDArray, covariance: NDArray, seen: NDArray) -> NDArray:
     white = whitened(error, factor, seen)
     constant = seen.sum(axis=2) * np.log(2 * np.pi)
     logs = np.log(np.diagonal(factor, axis1=2, axis2=3)).sum(axis=2)
-    made: NDArray = -0.5 * (np.sum(white**2, axis=2) + constant) - logs
-    return made
+    return -0.5 * (np.sum(white**2, axis=2) + constant) - logs
 
 
 def root_of(covariance: NDArray, seen: NDArray) -> NDArray:
@@ -207,5 +201,4 @@ def root_of(covariance: NDArray, seen: NDArray) -> NDArray:
 def whitened(error: NDArray, factor: NDArray, seen: NDArray) -> NDArray:
     """Errors (n, T, d_y) that are independent and of variance 1; 0 for those that are not seen."""
     own = np.where(seen, error, 0.0)[..., None]
-    made: NDArray = np.linalg.solve(factor, own)[..., 0]
-    return made
+    return np.linalg.solve(factor, own)[..., 0]

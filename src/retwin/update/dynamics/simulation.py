@@ -101,5 +101,4 @@ class FreeSimulation:
         )
         variances = self.free_process, self.noise
         found = steps.filter(commands, theta, unseen, known, variances)[1]
-        made: NDArray = np.diagonal(found, axis1=2, axis2=3)
-        return made
+        return np.diagonal(found, axis1=2, axis2=3)

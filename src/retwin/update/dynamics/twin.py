@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -128,29 +128,12 @@ class DynamicsTwin:
     @property
     def filter(self) -> DynamicsFilter:
         """The extended Kalman filter, on arrays."""
-        return DynamicsFilter(
-            self.equations,
-            self.values,
-            self.factor,
-            self.process,
-            self.proportional,
-            self.noise,
-            self.domain,
-        )
+        return DynamicsFilter(**_fields_for(DynamicsFilter, self))
 
     @property
     def simulation(self) -> FreeSimulation:
         """Simulations from commands alone, on arrays."""
-        return FreeSimulation(
-            self.equations,
-            self.values,
-            self.factor,
-            self.start_deviation,
-            self.free_process,
-            self.noise,
-            self.widening,
-            self.constant,
-        )
+        return FreeSimulation(**_fields_for(FreeSimulation, self))
 
     def simulate(
         self,
@@ -327,8 +310,7 @@ class DynamicsTwin:
         )
         values = np.tile(self.values[: -len(self.process)], (len(states), 1))
         p = list(torch.tensor(values if changes is None else values + changes).unbind(1))
-        made: NDArray = torch.stack(self.equations.model.evaluate("slope", x, u, p), 1).numpy()
-        return made
+        return torch.stack(self.equations.model.evaluate("slope", x, u, p), 1).numpy()
 
     @property
     def axes(self) -> list[tuple[str, str]]:
@@ -386,3 +368,8 @@ class DynamicsTwin:
         Raises InputError if the folder holds no such model or is damaged.
         """
         return cls(**read_fields(folder))
+
+
+def _fields_for(kind: type[Any], twin: DynamicsTwin) -> dict[str, Any]:
+    """The fields of a twin that a part of it has too, by name."""
+    return {each.name: getattr(twin, each.name) for each in fields(kind)}

@@ -129,10 +129,10 @@ class Windows:
         """Starts (w, m) at the present values, at which every search of others begins."""
         own = self._estimation
         start = np.tile(own.unknowns.start[own.unknowns.free], (len(self.rows), 1))
-        return self._searched(own, start)
+        return self._search(own, start)
 
     @staticmethod
-    def _searched(own: Estimation, start: NDArray) -> NDArray:
+    def _search(own: Estimation, start: NDArray) -> NDArray:
         """The best starts (w, m) for an estimation; those given where a simulation fails."""
         found = own.linearised(Point(np.zeros(0), start))
         return own.minimised(found).point.starts if found.finite else start
@@ -142,7 +142,7 @@ class Windows:
         """Starts (w, m), outputs (w, L, d_y) and derivatives by all parameters of `StateTwin`."""
         twin = self.twin.with_values(theta)
         own = replace(self._estimation, unknowns=self._unknowns(twin))
-        starts = self._searched(own, self._present)
+        starts = self._search(own, self._present)
         point = own.theta(Point(np.zeros(0), starts))
         outputs, slopes = own.twin.steps().sensitivities(own.commands, point)
         return starts, outputs, slopes
@@ -167,7 +167,7 @@ class Windows:
 
     def outputs(self, theta: NDArray) -> NDArray:
         """Outputs (n, T, d_y) at parameters (k,): NaN where a simulation fails, 0 in no window."""
-        return self._joined(self._at(tuple(theta.tolist()))[1])
+        return self._join(self._at(tuple(theta.tolist()))[1])
 
     def derivatives(self, theta: NDArray) -> NDArray:
         """Derivatives (n, T, d_y, k) of the outputs by the parameters, where the starts follow."""
@@ -176,13 +176,13 @@ class Windows:
         mixed = slopes[..., :parameters] @ self.twin.mixing[:parameters]
         by_start = slopes[..., parameters + np.flatnonzero(self.unknown)]
         if not (np.isfinite(mixed).all() and np.isfinite(by_start).all()):
-            return self._joined(np.full_like(mixed, np.nan))
+            return self._join(np.full_like(mixed, np.nan))
         weight = own.seen[..., None] / self.unit[:, None]
         flat = [(weight * e).reshape(len(e), -1, e.shape[-1]) for e in (by_start, mixed)]
         follow = np.linalg.pinv(flat[0], DEPENDENT) @ flat[1]
-        return self._joined(mixed - by_start @ follow[:, None])
+        return self._join(mixed - by_start @ follow[:, None])
 
-    def _joined(self, windows: NDArray) -> NDArray:
+    def _join(self, windows: NDArray) -> NDArray:
         """Values (n, T, …) of those of the windows (w, L, …)."""
         made = np.zeros((*self.observed.mask.shape[:2], *windows.shape[2:]))
         within = self.first[:, None] + np.arange(self.length) < self.observed.steps

@@ -139,10 +139,10 @@ def choose_length(observed: Trajectories, fit: Fit, stride: int, *, whole: bool)
     best = np.where(np.isfinite(logs), logs, np.inf).min(axis=0)
     known = np.isfinite(best)
     useful = np.where(known, best, 0.0).sum(axis=0) < 0
-    return _ranked(lengths, logs[..., useful] if useful.any() else logs[..., -1:])
+    return _rank(lengths, logs[..., useful] if useful.any() else logs[..., -1:])
 
 
-def _ranked(lengths: Sequence[int | None], logs: NDArray) -> list[Candidate]:
+def _rank(lengths: Sequence[int | None], logs: NDArray) -> list[Candidate]:
     """Candidates with logarithms of errors (c, K, h), the chosen one first."""
     known = np.isfinite(logs).any(axis=0)
     each = np.where(np.isnan(logs), np.inf, logs)[:, known]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.data.measured import measured_only, unmeasured
 from retwin.data.quality.copies import find_copies
 from retwin.data.trajectories import Trajectories
@@ -217,7 +217,7 @@ def identify(
         with begin(twin, observed) as misfit:
             found = infer_posterior(misfit, method, progress)
     else:
-        found = _searched(twin, observed, method, horizon, (begin, missing, progress))
+        found = _search(twin, observed, method, horizon, (begin, missing, progress))
         copies = int(found.figures["copies"])
         again = f"{copies} of {len(observed)} trajectories are copies and count once"
         for note in filter(None, [found.identifiability.warning, missing, again * bool(copies)]):
@@ -225,7 +225,7 @@ def identify(
     return replace(found, seconds=time.perf_counter() - began)
 
 
-def _searched(
+def _search(
     twin: ParametricTwin,
     observed: Trajectories,
     method: LeastSquares | Evolution,
@@ -239,7 +239,7 @@ def _searched(
         choice = horizon is None and state_based(twin)
         try:
             with begin(twin, observed) as misfit:
-                found, stride = _fitted(misfit, method, missing, progress), misfit.stride
+                found, stride = _fit(misfit, method, missing, progress), misfit.stride
         except InputError:
             usable = isinstance(observed, Trajectories)
             if not (choice and usable and lasting(twin, observed)):
@@ -253,22 +253,18 @@ def _searched(
         def fit(part: Trajectories, windows: int | None) -> ParametricTwin:
             own = twin if windows or found is None else found.twin
             with begin(own, part, length=windows) as misfit:
-                return _fitted(misfit, LeastSquares(1, method.loss), "", None).twin
+                return _fit(misfit, LeastSquares(1, method.loss), "", None).twin
 
         candidates = choose_length(observed, fit, stride, whole=found is not None)
         length = candidates[0].length if candidates else None
         if length is None:
-            require(
-                found is not None,
-                "observed",
-                expected="records of 200 samples or more, for a twin that cannot simulate them",
-                got=f"{observed.steps} samples",
-                remedy="choose other starts of the parameters, or give longer records",
-            )
-            assert found is not None
+            expected = "records of 200 samples or more, for a twin that cannot simulate them"
+            remedy = "choose other starts of the parameters, or give longer records"
+            got = f"{observed.steps} samples"
+            found = given("observed", found, expected, got=got, remedy=remedy)
             return replace(found, horizons=tuple(candidates))
     with begin(twin, observed, length=length) as misfit:
-        again = _fitted(misfit, method, missing, progress)
+        again = _fit(misfit, method, missing, progress)
     return replace(again, horizon=length / observed.rate, horizons=tuple(candidates), lasting=True)
 
 
@@ -295,7 +291,7 @@ def _samples_of(horizon: float | None, twin: ParametricTwin, observed: Trajector
     return round(horizon * observed.rate)
 
 
-def _fitted(
+def _fit(
     misfit: Misfit, method: LeastSquares | Evolution, missing: str, progress: Progress | None
 ) -> Updated:
     """The parameters that fit best; `missing` describes outputs that were never measured."""

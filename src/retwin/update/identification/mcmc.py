@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra, require, whole
+from retwin.checks import needs_extra, whole
 from retwin.progress import Progress
 from retwin.update.identification.noise import Noise
 from retwin.update.identification.problem import BoxProblem
@@ -59,13 +59,8 @@ class MCMC:
     ) -> tuple[NDArray, dict[str, float], str]:
         """Points (s, k + q), figures, and a warning, or "" where there is none."""
         emcee = needs_extra("emcee", "bayes", "samples posteriors")
-        require(
-            self.walkers >= 2 * problem.size,
-            "walkers",
-            expected=f"at least {2 * problem.size}, twice the parameters and scales",
-            got=self.walkers,
-            remedy="give more walkers, or free fewer parameters",
-        )
+        remedy = "give twice as many as parameters and scales, or free fewer parameters"
+        whole("walkers", self.walkers, least=2 * problem.size, remedy=remedy)
         rng = np.random.default_rng(seed)
         sampler = emcee.EnsembleSampler(
             self.walkers,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pebble import ProcessPool
 
-from retwin.checks import require, whole
+from retwin.checks import instance, require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
@@ -179,7 +179,7 @@ def misfit_of(
     """
     checked_seed(seed)
     whole("processes", processes, least=1)
-    stride = _checked(twin, observed, rate)
+    stride = _check_data(twin, observed, rate)
     windows = None
     if state_based(twin):
         windows = windows_of(twin, observed, length, sampled(observed.mask, stride))
@@ -221,15 +221,10 @@ def _in_worker(
         return _outputs(twin, commands, stride, seed, theta)
 
 
-def _checked(twin: ParametricTwin, observed: Trajectories, rate: float | None) -> int:
+def _check_data(twin: ParametricTwin, observed: Trajectories, rate: float | None) -> int:
     """The stride of the residuals; InputError if twin and data do not fit each other."""
-    require(
-        isinstance(twin, ParametricTwin),
-        "twin",
-        expected="a ParametricTwin, which declares its free parameters",
-        got=type(twin).__name__,
-        remedy="see ParametricTwin, CommandSide and ParametricTwin.built",
-    )
+    remedy = "declare its free parameters: see ParametricTwin, CommandSide and ParametricTwin.built"
+    instance("twin", twin, ParametricTwin, remedy=remedy)
     stride = checked_stride(twin, observed, rate, "observed")
     count = int(observed.mask[:, ::stride].sum())
     require(

@@ -76,7 +76,7 @@ class Noise:
         noise = scales[:, 0, None, None]
         if self.discrepancy:
             amplitude, duration = scales[:, 1:].T
-            return _filtered(residual, seen, noise, amplitude, duration, interval)
+            return _filter(residual, seen, noise, amplitude, duration, interval)
         size = residual / noise[..., None]
         if self.degrees is not None:
             each = student.logpdf(size, self.degrees)
@@ -107,7 +107,7 @@ class Noise:
         return error
 
 
-def _filtered(
+def _filter(
     residual: NDArray,
     seen: NDArray,
     noise: NDArray,

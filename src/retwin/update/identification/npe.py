@@ -8,25 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra, whole
+from retwin.checks import finite, needs_extra, positive, whole
 from retwin.progress import Progress
 from retwin.update.identification.noise import Noise
 from retwin.update.identification.problem import BoxProblem
 from retwin.update.identification.summaries import Summaries
 
-MARGIN = 0.25
-"""Margin of the next round's box on either side, over the width of the posterior."""
-TAIL = 1e-3
-"""Probability of the posterior outside its box, on either side."""
 OVERSAMPLING = 4
 """Draws per sample of the posterior, since those outside the prior's box are rejected."""
 MIN_ACCEPTED = 0.1
 """Share of the samples; where fewer lie in the prior's box, draws are clipped to it instead."""
-HIDDEN, COMPONENTS = 64, 2
-"""Width and components of the mixture density network: in the last box a posterior is nearly
-Gaussian."""
-BATCH_SIZE, LEARNING_RATE, CLIP = 256, 5e-3, 5.0
-"""Examples per step, learning rate, and largest norm of the gradient in its training."""
 VALIDATION = 10
 """One in this many points is held out to choose the best epoch."""
 
@@ -54,11 +45,20 @@ class NPE:
         `problem.NOISES` draws of noise.
     noise : Noise
         Distribution of the output error, whose scales are inferred too.
+    hidden, components : int
+        Width and components of the mixture density network, at least 1: in the last box a
+        posterior is nearly Gaussian.
+    batch_size, learning_rate, clip
+        Examples per step, learning rate, and largest norm of the gradient in its training.
+    margin : float
+        Margin of the next round's box on either side, at least 0, over the width of the posterior.
+    tail : float
+        Probability of the posterior outside its box, on either side, from 0 to 0.49.
 
     Raises
     ------
     InputError
-        A count below its minimum.
+        A count below its minimum, or another setting out of its range.
 
     References
     ----------
@@ -72,12 +72,24 @@ class NPE:
     samples: int = 4000
     max_epochs: int = 20
     noise: Noise = field(default_factory=Noise)
+    hidden: int = 64
+    components: int = 2
+    batch_size: int = 256
+    learning_rate: float = 5e-3
+    clip: float = 5.0
+    margin: float = 0.25
+    tail: float = 1e-3
 
     def __post_init__(self) -> None:
         whole("simulations", self.simulations, least=50)
         whole("rounds", self.rounds, least=1)
         whole("samples", self.samples, least=100)
-        whole("max_epochs", self.max_epochs, least=1)
+        for name in ("max_epochs", "hidden", "components", "batch_size"):
+            whole(name, getattr(self, name), least=1)
+        positive("learning_rate", self.learning_rate)
+        positive("clip", self.clip)
+        finite("margin", self.margin, least=0.0)
+        finite("tail", self.tail, least=0.0, most=0.49)
 
     def sample(
         self, problem: BoxProblem, *, seed: int, progress: Progress | None
@@ -106,8 +118,8 @@ class NPE:
             if progress is not None:
                 progress((done + 1) / self.rounds)
             if done < self.rounds - 1:
-                ends = np.quantile(drawn, [TAIL, 1 - TAIL], axis=0)
-                margin = MARGIN * (ends[1] - ends[0]) + 1e-6
+                ends = np.quantile(drawn, [self.tail, 1 - self.tail], axis=0)
+                margin = self.margin * (ends[1] - ends[0]) + 1e-6
                 box = np.clip([ends[0] - margin, ends[1] + margin], box[0], box[1])
         volume = float(np.mean(np.log10(box[1] - box[0])))
         figures = {"loss": loss, "box_log10_width": volume, "kept": float(len(points))}
@@ -142,9 +154,9 @@ class NPE:
 
         with isolated(seed):
             network = neural_nets.posterior_nn(
-                "mdn", z_score_x="none", hidden_features=HIDDEN, num_components=COMPONENTS
+                "mdn", z_score_x="none", hidden_features=self.hidden, num_components=self.components
             )(*fitted_on)
-        how = Training(self.max_epochs, BATCH_SIZE, LEARNING_RATE, clip=CLIP)
+        how = Training(self.max_epochs, self.batch_size, self.learning_rate, clip=self.clip)
         fit = train(network, loss, fitted_on, held_out, how, seed=seed)
         with isolated(seed), torch.no_grad():
             count = OVERSAMPLING * self.samples

@@ -112,7 +112,7 @@ def profile(
         distance = MARGIN * np.sqrt(limit) * error / search.width[which]
         low, high = max(best[which] - distance, 0.0), min(best[which] + distance, 1.0)
         grid = np.unique(np.append(np.linspace(low, high, points), best[which]))
-        sums = _profiled(search, which, grid, best)
+        sums = _profile_sums(search, which, grid, best)
         _, residual, curvature = search.linearised(misfit.residuals(search.theta(best[None]))[0])
         noise = curvature * variance_of(residual, int(misfit.seen.sum()), len(names))
         noise *= (error / local.white[which]) ** 2 if np.isfinite(error) else 1.0
@@ -125,7 +125,7 @@ def profile(
     )
 
 
-def _profiled(search: Search, which: int, grid: NDArray, best: NDArray) -> NDArray:
+def _profile_sums(search: Search, which: int, grid: NDArray, best: NDArray) -> NDArray:
     """Sums of losses with one parameter held on a grid, from the optimum outwards."""
     others = np.arange(len(best)) != which
     search.free = others

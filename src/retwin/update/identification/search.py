@@ -159,11 +159,11 @@ class Search:
             others = LatinHypercube(size, rng=rng).random(self.method.starts - 1)
             starts = np.concatenate([now[None], others])
         else:
-            starts = self._evolved(now, rng)[None]
+            starts = self._evolve(now, rng)[None]
         robust = self.method.loss != "linear"
         found = []
         for done, start in enumerate(starts, 1):
-            found.append(self._from(start))
+            found.append(self._search_from(start))
             if self.progress is not None:
                 self.progress(done / len(starts) * (0.5 if robust else 1.0))
         if robust:
@@ -186,7 +186,7 @@ class Search:
         optima = [self._optimum(*each) for each in zip(starts, found, strict=True)]
         return sorted(optima, key=lambda each: each[0].objective)
 
-    def _from(self, start: NDArray) -> OptimizeResult:
+    def _search_from(self, start: NDArray) -> OptimizeResult:
         """The optimum from a start, whose dead times are the best before and after the search."""
         found = self.descend(self._with_best_delays(start))
         again = self._with_best_delays(found.x)
@@ -211,7 +211,7 @@ class Search:
                 point = min(tried, key=lambda each: rest(each, place))
         return point
 
-    def _evolved(self, now: NDArray, rng: np.random.Generator) -> NDArray:
+    def _evolve(self, now: NDArray, rng: np.random.Generator) -> NDArray:
         assert isinstance(self.method, Evolution)
         generations = self.method.generations
 

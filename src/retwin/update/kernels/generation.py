@@ -35,7 +35,7 @@ def library() -> ctypes.CDLL | None:
 
 def along_pieces(surrogate: Any, commands: NDArray) -> NDArray | None:
     """The outputs (n, T, d_y) of a surrogate; see `evaluate_piecewise_linear`."""
-    kernel, packed = library(), _packed(surrogate)
+    kernel, packed = library(), _pack(surrogate)
     if kernel is None or packed is None or commands.shape[1] < 2 or not len(commands):
         return None
     values = np.ascontiguousarray(commands, np.float32)
@@ -51,7 +51,7 @@ def at_effective_commands(
 
     See `effective_commands` for the other arguments.
     """
-    kernel, packed = library(), _packed(surrogate)
+    kernel, packed = library(), _pack(surrogate)
     plain = _plain(reference, z) and not when.is_floating_point() and len(reference) == len(z)
     if kernel is None or packed is None or not plain or not reference.numel():
         return None
@@ -77,7 +77,7 @@ def jacobians(surrogate: Any, commands: Tensor) -> Tensor | None:
     None depends on the others. Of a surrogate in double precision that has the attribute `single`,
     these are the derivatives of that one.
     """
-    kernel, packed = library(), _packed(getattr(surrogate, "single", surrogate))
+    kernel, packed = library(), _pack(getattr(surrogate, "single", surrogate))
     if kernel is None or packed is None or not commands.numel():
         return None
     shape = len(commands), len(packed[2])
@@ -134,7 +134,7 @@ def linearised_outputs(
         (n, S, d_y, P), the derivatives of the outputs in `unit`.
 
     """
-    kernel, packed = library(), _packed(getattr(surrogate, "single", surrogate))
+    kernel, packed = library(), _pack(getattr(surrogate, "single", surrogate))
     if kernel is None or packed is None or x.dtype != torch.float64 or not x.numel():
         return None
     (n, samples), (steps, width), outputs = times.shape, reference.shape[1:], len(packed[2])
@@ -192,7 +192,7 @@ def _plain(*tensors: Tensor) -> bool:
     return not graded and all(each.dtype == torch.float32 and each.is_cpu for each in tensors)
 
 
-def _packed(surrogate: Any) -> tuple[NDArray, NDArray, NDArray] | None:
+def _pack(surrogate: Any) -> tuple[NDArray, NDArray, NDArray] | None:
     """Widths, numbers and tolerances of a network, as the kernels take them; None of another."""
     layers = list(getattr(surrogate, "network", ()))
     dense = layers[::2]
@@ -206,13 +206,13 @@ def _packed(surrogate: Any) -> tuple[NDArray, NDArray, NDArray] | None:
         return None
     before, after = surrogate.before, surrogate.after
     mean, scale = after.mean.numpy(), after.scale.numpy()
-    numbers = [before.mean.numpy(), before.scale.numpy(), mean, scale, *map(_grouped, dense)]
+    numbers = [before.mean.numpy(), before.scale.numpy(), mean, scale, *map(_group, dense)]
     widths = [len(dense), dense[0].in_features, *(each.out_features for each in dense)]
     packed = np.concatenate(numbers, dtype=np.float32)
     return np.array(widths, np.int64), packed, (TOLERANCE * scale).astype(np.float32)
 
 
-def _grouped(dense: nn.Linear) -> NDArray:
+def _group(dense: nn.Linear) -> NDArray:
     """The weights of a layer and then its biases, for so many outputs at a time."""
     weights = dense.weight.detach().numpy()
     groups = -(-dense.out_features // OUTPUTS)

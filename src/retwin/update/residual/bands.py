@@ -86,13 +86,13 @@ def coverage_figures(
             remedy += ", or end it with a SampledSensor() if measurement noise is what it lacks"
         warnings.warn(
             f"correction: bands of 90 % hold {listed} of the calibration itself, since "
-            f"{_named(model)} cannot express what was measured; {remedy} (docs/corrections.md)",
+            f"{_operators(model)} cannot express what was measured; {remedy} (docs/corrections.md)",
             stacklevel=4,
         )
     return figures
 
 
-def _named(model: Residual) -> str:
+def _operators(model: Residual) -> str:
     """The operators of the correction, in series."""
     rest: list[object] = [model.correction]
     names = []

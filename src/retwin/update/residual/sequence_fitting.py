@@ -99,7 +99,7 @@ def fit_sequence(
         remedy="give longer records, fewer members, or shorter blocks",
     )
     _prepare(model, data, bounds, seed)
-    fitted = torch.stack([identified & ~_dilated(part, density.margin) for part in held_out])
+    fitted = torch.stack([identified & ~_dilate(part, density.margin) for part in held_out])
     rounds = 1 + density.refit
     fit = _train_members(model, data, fitted, seed, _part(progress, 0, rounds))
     figures = _calibrate(model, data, held_out)
@@ -194,7 +194,7 @@ def held_out_parts(valid: Tensor, density: SequenceMixture) -> Tensor:
     return fold == torch.arange(density.members)[:, None, None]
 
 
-def _dilated(held_out: Tensor, margin: int) -> Tensor:
+def _dilate(held_out: Tensor, margin: int) -> Tensor:
     """The flags (n, T) with `margin` samples more on either side."""
     wide = torch.nn.functional.max_pool1d(held_out.float()[:, None], 2 * margin + 1, 1, margin)
     return wide[:, 0] > 0

@@ -109,7 +109,7 @@ class Equations:
         v, y = given(v), outputs(y)
         a, b, c, out, direct, e = model = _linear(v, y, order)
         begin = _start(model, v, y)
-        states = _simulated(model, begin, v)[0]
+        states = _simulate(model, begin, v)[0]
         size = states.std(axis=(0, 1))
         size = np.where(size > 0, size, 1.0)
         speed = np.sqrt(np.mean(np.diff(states / size, axis=1) ** 2, axis=(0, 1)))
@@ -258,7 +258,7 @@ def _linear(v: NDArray, y: NDArray, order: int) -> Linear:
 def _start(model: Linear, v: NDArray, y: NDArray) -> NDArray:
     """The common first state (d_x,) of all simulations, by least squares."""
     a, out = model[0], model[3]
-    alone = _simulated(model, np.zeros(len(a)), v)[1]
+    alone = _simulate(model, np.zeros(len(a)), v)[1]
     power, effects = np.eye(len(a)), []
     for _ in range(v.shape[1]):
         effects.append(out @ power)
@@ -267,7 +267,7 @@ def _start(model: Linear, v: NDArray, y: NDArray) -> NDArray:
     return np.linalg.lstsq(np.concatenate(effects), target, rcond=1e-8)[0]
 
 
-def _simulated(model: Linear, begin: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:
+def _simulate(model: Linear, begin: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:
     """States (n, T, d_x) and outputs (n, T, d_y) of a linear model from a common first state."""
     a, b, c, out, direct, e = model
     x, states = np.tile(begin, (len(v), 1)), []

@@ -22,7 +22,7 @@ from retwin.twins.limits import Limits
 from retwin.twins.twin import Twin, checked_seed
 from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.state_surrogate.equations import ChannelScale
-from retwin.update.state_surrogate.search import Found, relative_error, searched
+from retwin.update.state_surrogate.search import Found, StateSearch, relative_error
 from retwin.update.state_surrogate.simulations import (
     MIN_SIMULATIONS,
     Simulations,
@@ -212,15 +212,14 @@ def fit_state_surrogate(
     check_outputs(training)
     expected = None if observed is None else twin.simulate(own[-1], seed=0)
     report(0.2)
-    found, history = searched(
-        training,
-        held_out,
+    search = StateSearch(
         orders=settings.states,  # type: ignore[arg-type]  # a tuple
         hidden=settings.hidden,
         accuracy=settings.accuracy,
         enough=_enough(settings.sufficient, training, expected, observed),
-        seed=seed,
-        progress=lambda share: report(0.2 + 0.7 * share),
+    )
+    found, history = search.run(
+        training, held_out, seed=seed, progress=lambda share: report(0.2 + 0.7 * share)
     )
     unknown = settings.unknown_start or first is not None
     made = _twin_of(twin, found, free, training, own, unknown_start=unknown)
@@ -229,12 +228,12 @@ def fit_state_surrogate(
         "hidden": float(len(found.equations.arrays["b"])),
         "simulations": float(len(training)),
     }
-    figures |= _tested(made, test, found, simulations.seconds, settings.allowed)
+    figures |= _test(made, test, found, simulations.seconds, settings.allowed)
     if expected is not None:
-        figures |= _compared(made, expected, observed, settings.allowed)
+        figures |= _compare(made, expected, observed, settings.allowed)
     else:
         for commands in own:
-            figures |= _compared(made, twin.simulate(commands, seed=0), None, settings.allowed)
+            figures |= _compare(made, twin.simulate(commands, seed=0), None, settings.allowed)
     report(1.0)
     duration = time.perf_counter() - began
     return FittedStateSurrogate(made, figures, history, duration, simulations.reason)
@@ -250,7 +249,7 @@ def _twin_of(
     unknown_start: bool,
 ) -> StateTwin:
     """The surrogate, whose limits are those of the commands in simulations, with a margin."""
-    simulated, parameters = _parted(training, len(twin.inputs))
+    simulated, parameters = _split(training, len(twin.inputs))
     low, high = (
         make([make(each, axis=(0, 1)) for each in (simulated, *own)], axis=0)
         for make in (np.min, np.max)
@@ -272,19 +271,19 @@ def _twin_of(
     return made(np.stack([visited.min(axis=(0, 1)), visited.max(axis=(0, 1))]))
 
 
-def _parted(made: Trajectories, width: int) -> tuple[NDArray, NDArray]:
+def _split(made: Trajectories, width: int) -> tuple[NDArray, NDArray]:
     """Commands (n, T, d_u) and parameters (n, k) of simulations."""
     return made.commands[..., :width], made.commands[:, 0, width:]
 
 
-def _tested(
+def _test(
     made: StateTwin, test: Trajectories, found: Found, seconds: float, allowed: float
 ) -> dict[str, float]:
     """Errors on simulations of which nothing was learned, and the ratio of speeds.
 
     Raises InputError where an error is larger than allowed.
     """
-    commands, parameters = _parted(test, len(made.inputs))
+    commands, parameters = _split(test, len(made.inputs))
     given = dict(zip((each.name for each in made.parameters), parameters.T, strict=True))
     values, simulate = made.values(given, len(test)), made.steps().run
     simulate(commands, values)  # which compiles it
@@ -339,7 +338,7 @@ def _enough(
     return share * float(sizes[seen.any(axis=(0, 1))].min(initial=np.inf))
 
 
-def _compared(
+def _compare(
     made: StateTwin, expected: Trajectories, observed: Trajectories | None, allowed: float
 ) -> dict[str, float]:
     """Errors on the user's own commands, at the present values of the parameters.

@@ -20,27 +20,6 @@ from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.unknowns import unknowns_of
 from retwin.update.state_surrogate.equations import Equations
 
-STRONGEST, WEAKEST, STEP = 0.1, 1e-8, 10.0
-"""Variances of the error that are assumed first and last, in those of the outputs, and the ratio of
-one to the next: from a prior so strong that the network begins near 0 to nearly none."""
-STEPS = 15
-"""Steps of the search with each variance at most."""
-FEW = 5
-"""The same on whole simulations, where the search ends as soon as the error is small enough."""
-MAX_PASSES = 16
-"""Number of searches at most, those with the last variance included."""
-WORTH = 0.95
-"""Ratio of errors below which a further search, or another state, is worth its time."""
-PATIENCE = 2
-"""Searches, or numbers of states, that are tried beyond the best one."""
-MAX_SAMPLES, MIN_STEPS = 30_000, 100
-"""Samples on which the search begins, the first ones of all simulations, and of each at least; it
-ends on whole simulations."""
-MORE = 8
-"""Largest number of states beyond the first that is tried."""
-COMPONENT = 0.01
-"""Standard deviation of a component of the outputs, over that of the first, which counts."""
-
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -76,23 +55,12 @@ def relative_error(error: NDArray, seen: NDArray, deviation: NDArray) -> NDArray
     return np.nan_to_num(rms, nan=np.inf) / deviation
 
 
-def searched(
-    training: Trajectories,
-    held_out: Trajectories,
-    *,
-    orders: Iterable[int],
-    hidden: int,
-    accuracy: float,
-    seed: int,
-    progress: Progress,
-    enough: float = 0.0,
-) -> tuple[Found, dict[int, float]]:
-    """The equations with the number of states that predicts held-out simulations best.
+@dataclass(frozen=True, kw_only=True)
+class StateSearch:
+    """The search for equations, with the number of states that predicts simulations best.
 
-    Parameters
+    Attributes
     ----------
-    training, held_out : Trajectories
-        Simulations whose inputs are the commands and the parameters.
     orders : iterable of int
         Numbers of states in the order in which they are tried; none for those from the number of
         components of the outputs on.
@@ -100,93 +68,152 @@ def searched(
         Width of the network; twice that is tried too if the error stays above the accuracy.
     accuracy : float
         No more states are tried once the error is below.
-    seed : int
-        Of the first weights.
-    progress : callable
-        Called with the share of the work that is done.
     enough : float
         The error from which on nothing is searched any more.
-
-    Returns
-    -------
-    Found
-        The best.
-    dict of int to float
-        The error by the number of states, over the samples on which the search begins.
+    strongest, weakest, ratio : float
+        Variances of the error that are assumed first and last, in those of the outputs, and the
+        ratio of one to the next: from a prior so strong that the network begins near 0 to nearly
+        none.
+    steps, few_steps : int
+        Steps of the search with each variance at most, and the same on whole simulations, where it
+        ends as soon as the error is small enough.
+    max_passes : int
+        Number of searches at most, those with the last variance included.
+    worth : float
+        Ratio of errors below which a further search, or another state, is worth its time.
+    patience : int
+        Searches, or numbers of states, that are tried beyond the best one.
+    max_samples, min_steps : int
+        Samples on which the search begins, the first ones of all simulations, and of each at least;
+        it ends on whole simulations.
+    more : int
+        Largest number of states beyond the first that is tried.
+    component : float
+        Standard deviation of a component of the outputs, over that of the first, which counts.
 
     """
-    first, rng = _components(training.observed), np.random.SeedSequence(seed)
-    steps = min(training.steps, max(MIN_STEPS, MAX_SAMPLES // len(training)))
-    part, other = (each.between(0, steps / each.rate) for each in (training, held_out))
 
-    def begun(order: int, width: int) -> Found:
-        equations = Equations.begun(part, order, width, np.random.default_rng(rng))
-        return fitted(part, other, equations, STRONGEST, enough)
+    orders: Iterable[int]
+    hidden: int
+    accuracy: float
+    enough: float = 0.0
+    strongest: float = 0.1
+    weakest: float = 1e-8
+    ratio: float = 10.0
+    steps: int = 15
+    few_steps: int = 5
+    max_passes: int = 16
+    worth: float = 0.95
+    patience: int = 2
+    max_samples: int = 30_000
+    min_steps: int = 100
+    more: int = 8
+    component: float = 0.01
 
-    best: Found | None = None
-    history: dict[int, float] = {}
-    worse = 0
-    for order in tuple(orders) or range(first, first + MORE + 1):
-        found = begun(order, hidden)
-        history[order] = found.error
-        worse += 1
-        if best is None or found.error < WORTH * best.error:
-            best, worse = found, 0
-        progress(0.6 * (1 - 0.7 ** len(history)))
-        if best.error < max(accuracy, enough) or (worse == PATIENCE and np.isfinite(best.error)):
-            break
-    assert best is not None
-    if best.error >= max(accuracy, enough):
-        best = min(best, begun(best.order, 2 * hidden), key=lambda each: each.error)
-        history[best.order] = best.error
-    progress(0.7)
-    if steps < training.steps and np.isfinite(best.error):
-        whole = _error_of(best.equations, held_out) if enough else np.inf
-        if whole > enough:
-            steps = FEW if enough else STEPS
-            best = fitted(training, held_out, best.equations, WEAKEST, enough, steps)
-        else:
-            best = Found(best.equations, whole)
-    return best, history
+    def run(
+        self, training: Trajectories, held_out: Trajectories, *, seed: int, progress: Progress
+    ) -> tuple[Found, dict[int, float]]:
+        """The equations with the number of states that predicts held-out simulations best.
 
+        Parameters
+        ----------
+        training, held_out : Trajectories
+            Simulations whose inputs are the commands and the parameters.
+        seed : int
+            Of the first weights.
+        progress : callable
+            Called with the share of the work that is done.
 
-def fitted(
-    training: Trajectories,
-    held_out: Trajectories,
-    equations: Equations,
-    variance: float,
-    enough: float = 0.0,
-    steps: int = STEPS,
-) -> Found:
-    """The equations whose search begins at some weights, with an assumed variance.
+        Returns
+        -------
+        Found
+            The best.
+        dict of int to float
+            The error by the number of states, over the samples on which the search begins.
 
-    It ends where the error of held-out simulations is `enough`.
-    """
-    twin = equations.trainable(training.inputs, training.outputs, training.rate)
-    starts = dict.fromkeys((f"start_{each.name}" for each in twin.states), 0.0)
-    weights = dict(zip(twin.names, equations.flat, strict=False))
-    unknowns = unknowns_of(twin, twin.parameters, starts | weights)
-    unknowns = replace(unknowns, deviation=np.ones(unknowns.count))
-    power = equations.outputs.deviation**2
-    estimation = Estimation(twin, training, unknowns, training.mask, power)
-    tested = Estimation(twin, held_out, unknowns, held_out.mask, power)
-    own, other = (np.zeros((len(each), 0)) for each in (training, held_out))
-    best, worse = Found(equations, np.inf), 0
-    now = estimation.linearised(Point(equations.flat, own))
-    for _ in range(MAX_PASSES):
-        if not now.finite:
-            break
-        now = replace(estimation, variance=variance * power).minimised(now, steps)
-        shared = now.point.shared
-        residual = tested.residual(Point(shared, other))
-        error = float(relative_error(residual, held_out.mask, equations.outputs.deviation).max())
-        worse = 0 if error < WORTH * best.error else worse + 1
-        if error < best.error:
-            best = Found(equations.with_weights(shared), error)
-        if worse == PATIENCE or best.error < enough:
-            break
-        variance = max(variance / STEP, WEAKEST)
-    return best
+        """
+        first, rng = self._count_components(training.observed), np.random.SeedSequence(seed)
+        steps = min(training.steps, max(self.min_steps, self.max_samples // len(training)))
+        part, other = (each.between(0, steps / each.rate) for each in (training, held_out))
+
+        def fit_order(order: int, width: int) -> Found:
+            equations = Equations.begun(part, order, width, np.random.default_rng(rng))
+            return self.fit(part, other, equations, self.strongest, self.steps)
+
+        best: Found | None = None
+        history: dict[int, float] = {}
+        worse, target = 0, max(self.accuracy, self.enough)
+        for order in tuple(self.orders) or range(first, first + self.more + 1):
+            found = fit_order(order, self.hidden)
+            history[order] = found.error
+            worse += 1
+            if best is None or found.error < self.worth * best.error:
+                best, worse = found, 0
+            progress(0.6 * (1 - 0.7 ** len(history)))
+            if best.error < target or (worse == self.patience and np.isfinite(best.error)):
+                break
+        assert best is not None
+        if best.error >= target:
+            wider = fit_order(best.order, 2 * self.hidden)
+            best = min(best, wider, key=lambda each: each.error)
+            history[best.order] = best.error
+        progress(0.7)
+        if steps < training.steps and np.isfinite(best.error):
+            whole = _error_of(best.equations, held_out) if self.enough else np.inf
+            if whole > self.enough:
+                steps = self.few_steps if self.enough else self.steps
+                best = self.fit(training, held_out, best.equations, self.weakest, steps)
+            else:
+                best = Found(best.equations, whole)
+        return best, history
+
+    def fit(
+        self,
+        training: Trajectories,
+        held_out: Trajectories,
+        equations: Equations,
+        variance: float,
+        steps: int,
+    ) -> Found:
+        """The equations whose search begins at some weights, with an assumed variance.
+
+        It ends where the error of held-out simulations is `enough`.
+        """
+        twin = equations.trainable(training.inputs, training.outputs, training.rate)
+        starts = dict.fromkeys((f"start_{each.name}" for each in twin.states), 0.0)
+        weights = dict(zip(twin.names, equations.flat, strict=False))
+        unknowns = unknowns_of(twin, twin.parameters, starts | weights)
+        unknowns = replace(unknowns, deviation=np.ones(unknowns.count))
+        power = equations.outputs.deviation**2
+        estimation = Estimation(twin, training, unknowns, training.mask, power)
+        tested = Estimation(twin, held_out, unknowns, held_out.mask, power)
+        own, other = (np.zeros((len(each), 0)) for each in (training, held_out))
+        best, worse = Found(equations, np.inf), 0
+        now = estimation.linearised(Point(equations.flat, own))
+        for _ in range(self.max_passes):
+            if not now.finite:
+                break
+            now = replace(estimation, variance=variance * power).minimised(now, steps)
+            shared = now.point.shared
+            residual = tested.residual(Point(shared, other))
+            error = float(
+                relative_error(residual, held_out.mask, equations.outputs.deviation).max()
+            )
+            worse = 0 if error < self.worth * best.error else worse + 1
+            if error < best.error:
+                best = Found(equations.with_weights(shared), error)
+            if worse == self.patience or best.error < self.enough:
+                break
+            variance = max(variance / self.ratio, self.weakest)
+        return best
+
+    def _count_components(self, outputs: NDArray) -> int:
+        """How many components outputs (n, T, d_y) have: fewer states cannot tell them apart."""
+        values = outputs.reshape(-1, outputs.shape[2])
+        deviation = values.std(axis=0)
+        scaled = (values - values.mean(axis=0)) / np.where(deviation > 0, deviation, 1.0)
+        size = np.linalg.svd(scaled, compute_uv=False)
+        return int(np.sum(size > self.component * size[0]))
 
 
 def _error_of(equations: Equations, made: Trajectories) -> float:
@@ -196,12 +223,3 @@ def _error_of(equations: Equations, made: Trajectories) -> float:
     simulated = twin.steps().run(made.commands.astype(np.float64), theta)[0]
     deviation = equations.outputs.deviation
     return float(relative_error(made.observed - simulated, made.mask, deviation).max())
-
-
-def _components(outputs: NDArray) -> int:
-    """How many components outputs (n, T, d_y) have: fewer states cannot tell them apart."""
-    values = outputs.reshape(-1, outputs.shape[2])
-    deviation = values.std(axis=0)
-    scaled = (values - values.mean(axis=0)) / np.where(deviation > 0, deviation, 1.0)
-    size = np.linalg.svd(scaled, compute_uv=False)
-    return int(np.sum(size > COMPONENT * size[0]))
