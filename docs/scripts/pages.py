@@ -33,6 +33,7 @@ OUTSIDE = {
     "benchmarks/results/systems.md": "results_systems.md",
     "benchmarks/results/monitor.md": "results_monitor.md",
     "benchmarks/results/speed.md": "results_speed.md",
+    "benchmarks/results/intervals.md": "results_intervals.md",
 }
 """Files and folders outside of docs/ that the site has too, and their names there."""
 EXECUTED = ("tutorial.md",)
