@@ -123,7 +123,10 @@ def _largest(fault: TimedFault | Stuck) -> float | None:
 def _share(
     monitor: Monitor, windows: _Windows, fault: TimedFault | Stuck, size: float | None
 ) -> float:
-    """The share of windows with an alarm after the onset; NaN if it cannot be simulated."""
+    """The share of windows with an alarm after the onset, of those without one before.
+
+    NaN if the fault cannot be simulated, or all windows have an alarm before.
+    """
     changed: dict[str, Any] = ({} if size is None else {"size": size}) | (
         {"end": None} if isinstance(fault, TimedFault) else {}
     )
@@ -148,5 +151,7 @@ def _share(
     seen = windows.cut(healthy.mask)
     measured = np.where(seen, windows.cut(observed, by_record=False), np.nan)
     state = monitor.start(len(measured))
-    watched = monitor.step(state, windows.cut(healthy.commands), measured)[1]
-    return float(watched.alarm[:, windows.lead :].any(axis=1).mean())
+    alarm = monitor.step(state, windows.cut(healthy.commands), measured)[1].alarm
+    # What alarms before the onset alarms again while its event lasts.
+    calm = ~alarm[:, : windows.lead].any(axis=1)
+    return float(alarm[calm, windows.lead :].any(axis=1).mean()) if calm.any() else np.nan
