@@ -55,7 +55,9 @@ def test_a_leak_is_reported_with_its_time_and_cause(watched: Path, call) -> None
     assert "(exact 95 % bound). Promised under the model: at most one in" in words
 
 
-def test_a_log_is_watched_by_its_mapping(watched: Path, call, tmp_path: Path) -> None:
+def test_a_log_is_watched_by_its_columns_or_its_mapping(
+    watched: Path, call, tmp_path: Path
+) -> None:
     record = rt.load(watched / "leak.npz")
     names = (*record.inputs.names, *record.outputs.names)
     columns = [*record.commands[0].T, *record.observed[0].T]
@@ -69,12 +71,29 @@ def test_a_log_is_watched_by_its_mapping(watched: Path, call, tmp_path: Path) ->
             mapping.append(f'{kind}.{name} = {{ signal = "{name}", unit = "{unit}" }}')
     (tmp_path / "m.toml").write_text("\n".join(mapping))
     replay = ("monitor", "replay", watched / "watch", tmp_path / "leak.csv")
-    code, _, err = call(*replay)
-    assert (code, "retwin data map" in err) == (2, True), err
-    code, printed, err = call(*replay, "--mapping", tmp_path / "m.toml", "--json")
+    for mapped in ((), ("--mapping", tmp_path / "m.toml")):
+        code, printed, err = call(*replay, *mapped, "--json")
+        assert code == 0, err
+        (found,) = json.loads(printed)["records"]
+        assert 300 <= found["alarms"][0]["time"] <= 315
+
+
+def test_tables_calibrate_without_a_model(call, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for name, steps, offset in (("healthy", 400, 0.0), ("later", 300, 8.0)):
+        values = np.c_[np.arange(steps), rng.normal(size=(steps, 2)), np.ones(steps)]
+        values[150:, 2] += offset
+        head = "time,flow,pressure,state"
+        np.savetxt(tmp_path / f"{name}.csv", values, delimiter=",", header=head, comments="")
+    out = tmp_path / "watch"
+    code, printed, err = call("monitor", "fit", tmp_path / "healthy.csv", "--out", out)
     assert code == 0, err
-    (found,) = json.loads(printed)["records"]
-    assert 300 <= found["alarms"][0]["time"] <= 315
+    assert "calibrated on 0.111 h of your data; causes are channels" in " ".join(printed.split())
+    assert "never change: state" in err
+    code, printed, err = call("monitor", "replay", out, tmp_path / "later.csv", "--json")
+    assert code == 0, err
+    (event,) = json.loads(printed)["records"][0]["alarms"][:1]
+    assert (event["output"], 150 <= event["time"] < 160) == ("pressure", True)
 
 
 def test_what_cannot_calibrate_leaves_nothing(watched: Path, call, tmp_path) -> None:

@@ -68,6 +68,13 @@ def test_all_commands_fit_one_screen(narrow) -> None:
         assert "…" not in line
 
 
+@pytest.mark.parametrize("name", [name for name, each in ALL.items() if hasattr(each, "params")])
+def test_the_help_of_a_command_fits_50_lines(narrow, name: str) -> None:
+    code, out, _ = narrow(*name.split(), "--help")
+    assert code == 0
+    assert len(out.splitlines()) <= 50
+
+
 RECORDED = (
     *("data info", "data convert", "data split", "identify", "fit", "next", "study"),
     *("diagnose fit", "diagnose invert", "diagnose predict", "bundle save", "bundle predict"),
@@ -79,7 +86,7 @@ RECORDED = (
 @pytest.mark.parametrize("name", RECORDED)
 def test_recorded_data_may_be_a_log_with_a_mapping(name: str) -> None:
     (option,) = (each for each in ALL[name].params if "--mapping" in each.opts)
-    assert option.help == "For a log: what `retwin data map` wrote.", "the same everywhere"
+    assert option.help == "What `retwin data map` wrote.", "the same everywhere"
 
 
 @pytest.mark.parametrize("name", ALL)

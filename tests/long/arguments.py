@@ -85,6 +85,7 @@ BASE = {
     "monitor audit": "alarms.jsonl",
     "monitor demo": "--seconds 1 --port 0",
     "monitor fit": "model real.npz",
+    "monitor recalibrate": "store --asset press",
     "monitor replay": "model real.npz",
     "monitor run": "--config reach.toml",
     "next": "reach.toml model --real real.npz --candidates 5 --count 1",

@@ -183,6 +183,10 @@ class LogReader:
         plain = float(f"{1 / step:.3g}")
         return plain if abs(plain * step - 1) < ROUNDED else 1 / step
 
+    def signals(self, path: str | Path) -> tuple[str, ...]:
+        """Names of the signals of a log, without its times."""
+        return tuple(self._log(Path(path), 1.0).signals)
+
     def measured_outputs(self, paths: Sequence[str | Path], twin: Twin) -> tuple[str, ...]:
         """Names of the outputs of a twin that some log holds, in the twin's order.
 

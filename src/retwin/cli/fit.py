@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 data_option = partial(typer.Option, metavar="FILE", rich_help_panel="Data")
 model_option = partial(typer.Option, rich_help_panel="Model; by default the case's")
-choice_option = partial(typer.Option, rich_help_panel="Choice")
 
 
 def _named(text: str, names: Iterable[str]) -> Any:
@@ -38,15 +37,13 @@ def _named(text: str, names: Iterable[str]) -> Any:
 ModelFolder = Annotated[
     Path, typer.Option(metavar="FOLDER", help="Where to save the updated twin.")
 ]
-RealSet = Annotated[
-    list[Path] | None, data_option(help="Real trajectories to calibrate on; may be repeated.")
-]
+RealSet = Annotated[list[Path] | None, data_option(help="Real trajectories; may be repeated.")]
 OneFile = Annotated[Path | None, data_option(help="Or one file that the case splits in two.")]
 TwinSet = Annotated[Path | None, data_option(help="Trajectories of the twin; else simulated.")]
 Simulations = Annotated[
     int | None, data_option(metavar="N", help="Trajectories simulated; else the case's.")
 ]
-CalibrateOn = Annotated[str, _named("healthy or all real trajectories.", catalog.CALIBRATE_ON)]
+CalibrateOn = Annotated[str, _named("healthy or all.", catalog.CALIBRATE_ON)]
 Network = Annotated[
     str | None, _named("Of a surrogate: mlp, lstm, tcn or state_space.", catalog.NETWORKS)
 ]
@@ -57,20 +54,14 @@ Density = Annotated[
     str | None, _named("Distribution: mixture, flow or sequence_mixture.", catalog.DENSITIES)
 ]
 Refine = Annotated[bool, model_option("--refine", help="Fine-tune on outputs afterwards.")]
-StateEquations = Annotated[
-    bool, model_option("--dynamics", help="Correct the state equations; learn them if need be.")
-]
-SurrogateMode = Annotated[
-    str, _named("auto (for a slow twin), on or off.", catalog.SURROGATE_MODES)
-]
-Compare = Annotated[
-    bool, choice_option("--compare/--no-compare", help="Compare candidates; else fit one alone.")
-]
+StateEquations = Annotated[bool, model_option("--dynamics", help="Correct the state equations.")]
+SurrogateMode = Annotated[str, _named("auto, on or off.", catalog.SURROGATE_MODES)]
+Compare = Annotated[bool, model_option("--compare/--no-compare", help="Compare candidates.")]
 Yardstick = Annotated[
     bool | None,
-    choice_option(
+    model_option(
         "--yardstick/--no-yardstick",
-        help="Compare with models without the twin; by default where no method is taken.",
+        help="Compare with models without the twin.",
     ),
 ]
 
@@ -99,11 +90,8 @@ def fit(
 ) -> None:
     """Update a twin by real records; save the updated twin.
 
-    Candidates are compared on parts of the records that are left out in turn, and the simplest of
-    the best is taken: the twin as it is, identified parameters, corrected state equations, a
-    correction of the outputs. --dynamics and --correction take one whatever the comparison shows;
-    a case with classes takes its own correction. That is one of a surrogate, as is any with
-    --network, --twin-data, --simulations or --refine.
+    The simplest candidate is taken that predicts left-out parts of the records
+    best; or that of --dynamics, of --correction, or of a case with classes.
     """
     import retwin as rt
     from retwin.evaluation.choice.surrogates import SurrogateSettings

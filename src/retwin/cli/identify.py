@@ -48,22 +48,20 @@ TwinName = Annotated[
     str,
     argument(
         "TWIN",
-        "plant.fmu, robot.xml, module:function, case.toml or a built-in case.",
+        "*.fmu, *.xml, module:object, or a case.",
         autocompletion=complete_twins,
     ),
 ]
 LogFiles = Annotated[list[Path], argument("LOG…", "Tables *.csv, or what rt.load reads.")]
 Out = Annotated[Path, option("FOLDER", "Where the results go.")]
-Free = Annotated[
-    list[str] | None, option("NAME=LOW:HIGH", "A free parameter, or NAME=LOW:HIGH:START.")
-]
+Free = Annotated[list[str] | None, option("NAME=LOW:HIGH", "A free parameter; or with :START.")]
 MethodName = Annotated[
     str,
     option(
         "NAME", "least_squares, evolution, bayes or npe.", "--method", names=catalog.IDENTIFICATIONS
     ),
 ]
-HoldOut = Annotated[float | None, option("X", "Share held out for validation; else 0.25.")]
+HoldOut = Annotated[float | None, option("X", "Share held out; else 0.25.")]
 Loss = Annotated[str | None, _panel("Method", "NAME", "soft_l1 (default), linear or cauchy.")]
 Starts = Annotated[
     int | None, _panel("Method", "N", "Starts of the search; else 4.", min=1, max=1000)
@@ -74,16 +72,14 @@ Horizon = Annotated[
     _panel(
         "Method",
         "SECONDS",
-        "Windows whose starts are estimated, or free for whole records; else chosen.",
+        "Windows to predict, or free.",
     ),
 ]
 Processes = Annotated[int, _panel("Method", "N", "Worker processes.", min=1, max=256)]
 Column = Annotated[
-    list[str] | None, _panel("Logs", "CHANNEL=NAME", "The column of a channel, if named otherwise.")
+    list[str] | None, _panel("Logs", "CHANNEL=NAME", "Column of a channel named otherwise.")
 ]
-Time = Annotated[
-    str | None, _panel("Logs", "NAME", "Column of the times; or NAME=ms, us, ns, iso.")
-]
+Time = Annotated[str | None, _panel("Logs", "NAME", "Column of the times; NAME=ms, us, ns, iso.")]
 Transient = Annotated[float, _panel("Logs", "SECONDS", "Begin of each log that is not used.")]
 Rate = Annotated[float | None, _panel(TWIN, "HZ", "Samples per second; else the log's.")]
 

@@ -10,19 +10,21 @@ import threading
 import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from functools import partial
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
 from retwin import catalog
-from retwin.checks import finite, positive, require
+from retwin.checks import at_least, finite, positive, require
 from retwin.cli.commands import Commands
 from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase, argument, option
-from retwin.cli.reading import case_named, read, saved, shown_records
+from retwin.cli.reading import case_named, read, read_signals, saved, shown_records
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.quality.check import check_records
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -32,6 +34,7 @@ from retwin.serialisation.places import check_place
 if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
     from retwin.monitor import Alarm, Cause, Monitor, Watched
+    from retwin.update import DynamicsTwin
 
 EVENT = ("file", "record", "from s", "to s", "what", "cause")
 """What is shown of an event."""
@@ -46,9 +49,9 @@ app = Commands(
 
 @app.command(epilog=example("retwin monitor fit model healthy.npz --out watch"))
 def fit(
-    model: Annotated[Path, argument("MODEL", "Corrected dynamics, or a diagnoser by inversion.")],
-    healthy: Annotated[
-        list[Path], argument("HEALTHY...", "Healthy records, best not those it was fitted to.")
+    files: Annotated[
+        list[Path],
+        argument("FILE...", "A model, unless there is no twin, and healthy records."),
     ],
     out: Annotated[Path, option("FOLDER", "Where to save the monitor.")],
     false_alarms: Annotated[
@@ -62,14 +65,20 @@ def fit(
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
-    """Calibrate a monitor on healthy records."""
-    from retwin.monitor import fit_monitor
+    """Calibrate a monitor on healthy records, best not those that MODEL was fitted to.
+
+    Without MODEL a black box of the records takes the place of a twin.
+    """
+    from retwin.monitor import fit_monitor, possible_causes, visible_sizes
     from retwin.monitor.detect.promise import duration
     from retwin.update import DynamicsTwin
 
     check_place(out, folder=True, holds=("model.json", "weights.safetensors", "twin", "diagnoser"))
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
-    if kind_of(saved(model)) in catalog.DIAGNOSERS:
+    model = files[0] if files[0].is_dir() and (files[0] / "model.json").is_file() else None
+    healthy = files[1:] if model else files
+    at_least("FILE", healthy, 1, "file", remedy="name healthy records after the model")
+    if model and kind_of(saved(model)) in catalog.DIAGNOSERS:
         require(
             lasting is None,
             "lasting",
@@ -79,27 +88,41 @@ def fit(
         )
         _fit_trajectories(model, healthy, out, false_alarms, case, reading, as_json)
         return
-    twin = DynamicsTwin.load(model)
-    system = case_named(case or twin.case or None)
-    records = [_healthy(reading(file, system), file) for file in healthy]
+    known = DynamicsTwin.load(model) if model else None
+    system = case_named(case or (known.case if known else None) or None)
+    if known is None and system is None and mapping is None and _tables(healthy):
+        records = [read_signals(healthy, max_bytes)]
+    else:
+        records = [
+            _healthy(reading(file, system or _named(known, file, mapping)), file)
+            for file in healthy
+        ]
     with bar("calibrate") as show:
         show("monitor", 0.0)
         given = Trajectories.concatenate(records)
         checked = check_records(given)
         made = fit_monitor(
-            twin, given, false_alarms, lasting=3600.0 if lasting is None else lasting
+            known, given, false_alarms, lasting=3600.0 if lasting is None else lasting
         )
+        show("faults that are seen", 0.5)
+        causes = possible_causes(made.twin, system.alarm_causes if system else None)
+        made = replace(made, visible=tuple(visible_sizes(made, given, causes)))
     made.save(out)
+    twin = made.twin
+    hours = given.mask.any(axis=2).sum() / twin.rate / 3600
+    box = f"No twin: a black box, calibrated on {hours:.3g} h of your data; causes are channels."
     promises = {name: str(each) for name, each in made.promises.items()}
     tried = made.tried.text(twin.rate)
     about = {"arl": made.arl, "run_length": made.run_length, "warm_up": made.warm_up}
     answer(
         {"saved": str(out), **about, "promises": promises, "tried": vars(made.tried)}
-        | {"records": checked.values},
+        | {"records": checked.values, "visible": [vars(each) for each in made.visible]},
         *shown_records(checked),
+        *([] if known else [box]),
         f"Promised under the model: {duration(made.run_length / twin.rate)} to a false event.",
         f"Tried: {tried}",
         *(f"{name}: {text}" for name, text in promises.items()),
+        *map(str, made.visible),
         as_json=as_json,
     )
     note(f"Saved {out}")
@@ -125,7 +148,7 @@ def replay(
     system = case_named(case or made.twin.case or None)
     found, rows = [], []
     for file in logs:
-        record = reading(file, system)
+        record = reading(file, system or _named(made.twin, file, mapping))
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
         found.append((file, record, watched, causes))
@@ -313,6 +336,38 @@ def audit(
     if reason:
         complain(reason)
         raise typer.Exit(BAD_INPUT)
+
+
+@app.command(epilog=example("retwin monitor recalibrate store --asset press"))
+def recalibrate(
+    store: Annotated[Path, argument("STORE", "Folder of the store.")],
+    asset: Annotated[str, option("NAME", "The machine.")],
+    hours: Annotated[float, option("H", "Newest hours of which quiet ones are used.")] = 24.0,
+    new_normal: Annotated[
+        bool, option("", "A change that lasts is no fault but the new normal.", "--new-normal")
+    ] = False,
+    url: Annotated[str, option("URL", "The PostgreSQL database, if one.")] = "",
+    as_json: Json = False,
+) -> None:
+    """Propose a monitor of the last quiet hours, in the shadow of the active one."""
+    from retwin.monitor import Store
+    from retwin.monitor import recalibrate as propose
+
+    with Store(saved(store), url) as opened, bar("calibrate") as show:
+        show("monitor", 0.0)
+        version = propose(opened, asset, hours=hours, new_normal=new_normal)
+    text = f"Version {version.number}, of {version.reason}, is in the shadow of the active one."
+    answer(vars(version), text, as_json=as_json)
+
+
+def _tables(files: Sequence[Path]) -> bool:
+    return all(each.suffix.lower() == ".csv" for each in files)
+
+
+def _named(twin: DynamicsTwin | None, file: Path, mapping: Path | None) -> Any:
+    """What `read` takes for a case: the twin by whose channels the columns of a table are named."""
+    wanted = twin is not None and mapping is None and _tables([file])
+    return SimpleNamespace(twin=twin) if wanted else None
 
 
 def _healthy(record: Trajectories, file: Path) -> Trajectories:

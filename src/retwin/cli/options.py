@@ -57,9 +57,7 @@ Measured = Annotated[Path, argument("FILE", "Trajectories; labels are not needed
 Probabilities = Annotated[Path | None, option("FILE", "CSV file for all probabilities.", "--out")]
 PerClass = Annotated[int, option("N", "Trajectories per class.")]
 Rate = Annotated[float | None, option("HZ", "Samples per second, if the file has none.", "--rate")]
-LogMapping = Annotated[
-    Path | None, option("FILE", "For a log: what `retwin data map` wrote.", "--mapping")
-]
+LogMapping = Annotated[Path | None, option("FILE", "What `retwin data map` wrote.", "--mapping")]
 TWIN = "Twin"
 """The panel of help with the options of a twin that is no case."""
 Inputs = Annotated[
@@ -68,9 +66,7 @@ Inputs = Annotated[
 Outputs = Annotated[
     str, option("NAMES", "Of the outputs, joined by commas.", "--outputs", rich_help_panel=TWIN)
 ]
-MaxBytes = Annotated[
-    int | None, option("N", "Most that a file may hold; else by what is free.", min=1)
-]
+MaxBytes = Annotated[int | None, option("N", "Limit of a file; else by what is free.", min=1)]
 MAX_SEED = 2**63 - 1
 """The largest seed that every generator of random numbers takes."""
 Seed = Annotated[
@@ -86,7 +82,7 @@ Seed = Annotated[
 Json = Annotated[bool, option("", "Print JSON instead, and nothing else.", "--json")]
 
 Horizon = Annotated[
-    str, option("TIME", "Judge by predictions so far ahead, as 1s; or free.", "--horizon")
+    str, option("TIME", "Judge by predictions so far ahead: 1s, free.", "--horizon")
 ]
 
 

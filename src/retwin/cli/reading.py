@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,6 +91,31 @@ def read(
             max_bytes=max_bytes,
             mapping=mapping,
         )
+
+
+def read_signals(files: Sequence[Path], max_bytes: int | None = None) -> Trajectories:
+    """The signals of tables as outputs, without commands; one that never changes is left out."""
+    from retwin.cases import LogReader
+    from retwin.data.trajectories import Channels
+    from retwin.twins import FunctionTwin
+
+    reader = LogReader(max_bytes=max_bytes)
+    names = reader.signals(files[0])
+    rate = given("rate", reader.rate(files[0], names), "a column of times", remedy="add one")
+    while True:
+        channels = Channels(names, ("1",) * len(names))
+        nothing = np.zeros(len(names))
+        # Its outputs stand for those of no model: only the names of its channels are read.
+        zeros = partial(lambda row, u: np.tile(row, (*u.shape[:2], 1)), nothing)
+        twin = FunctionTwin(zeros, rate=rate, inputs=Channels((), ()), outputs=channels)
+        found = reader.trajectories(files, twin).trajectories
+        seen = np.where(found.mask, found.observed, np.nan)
+        low, high = np.nanmin(seen, axis=(0, 1)), np.nanmax(seen, axis=(0, 1))
+        fixed = [n for n, least, most in zip(names, low, high, strict=True) if least == most]
+        if not fixed or len(fixed) == len(names):
+            return found
+        note(f"Left out, since they never change: {', '.join(fixed)}")
+        names = tuple(name for name in names if name not in fixed)
 
 
 def read_all(

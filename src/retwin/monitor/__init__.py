@@ -30,6 +30,8 @@ _HOME = homes(
         "models.trajectories": "TrajectoryMonitor",
         "models.trajectory_fitting": "fit_trajectory_monitor",
         "models.trajectory_state": "TrajectoryState",
+        "models.visibility": "visible_sizes",
+        "models.visible": "Visible",
         "models.watched": "Alarm Watched",
         "models.watched_trajectories": "TrajectoryAlarm WatchedTrajectories",
         "store.audit": "Audit Entry export_log read_log verify",
@@ -38,6 +40,7 @@ _HOME = homes(
         "store.updates": "Asset Committed Update",
         "versions.comparison": "compare",
         "versions.decision": "Decision decide",
+        "versions.recalibration": "recalibrate",
         "versions.registry": "Registry Version",
     }
 )

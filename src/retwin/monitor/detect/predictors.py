@@ -108,9 +108,10 @@ def settled(online: OnlineFilter, count: int, given: tuple[NDArray, ...]) -> int
     """
     start = online.start(count)
     own, other = (
-        online.step(each, *given)[2] for each in (start, replace(start, spread=start.spread / 4))
+        np.diagonal(online.step(each, *given)[2], axis1=2, axis2=3)
+        for each in (start, replace(start, spread=start.spread / 4))
     )
-    ratio = np.diagonal(own / other, axis1=2, axis2=3)
+    ratio = own / other
     # Where nothing is measured, as after the end of a shorter record, nothing is known better.
     differs = ((np.abs(np.log(ratio)) > 2 * np.log(SETTLED)) & given[2]).any(axis=(0, 2))
     differs = differs[: own.shape[1] // 2]

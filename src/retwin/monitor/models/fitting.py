@@ -32,6 +32,8 @@ from retwin.monitor.detect.scores import fit_scores, resolution
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.models.monitor import Monitor
 from retwin.twins.twin import check_channels
+from retwin.update.blackbox import fit_black_box
+from retwin.update.blackbox.levels import fit_levels
 from retwin.update.dynamics.prediction import log_density
 from retwin.update.dynamics.twin import DynamicsTwin
 
@@ -46,7 +48,7 @@ FOLDS = 8
 
 
 def fit_monitor(
-    twin: DynamicsTwin,
+    twin: DynamicsTwin | None,
     healthy: Trajectories,
     false_alarms_at_most: str | float = "1 per month",
     *,
@@ -57,8 +59,9 @@ def fit_monitor(
 
     Parameters
     ----------
-    twin : DynamicsTwin
-        The corrected twin, of `fit_dynamics`.
+    twin : DynamicsTwin or None
+        The corrected twin, of `fit_dynamics`; None for a black box of these records, which is "arx"
+        where they have commands, and else a level of each output.
     healthy : Trajectories
         Healthy records, best of several days, that the twin was not fitted to: the errors of those
         are smaller than of others, and the promise is that of these errors. Each is left out in
@@ -83,7 +86,12 @@ def fit_monitor(
         sensor gives.
 
     """
-    instance("twin", twin, DynamicsTwin, remedy="fit it by fit_dynamics")
+    twin = instance(
+        "twin",
+        _black_box(healthy) if twin is None else twin,
+        DynamicsTwin,
+        remedy="fit it by fit_dynamics",
+    )
     check_channels(twin, healthy, "healthy")
     check_magnitude("healthy", healthy)
     arl = false_alarms(false_alarms_at_most, twin.rate)
@@ -125,6 +133,13 @@ def fit_monitor(
     predictors = tuple(each.predictor for each in found)
     more = (noise, Tried(*pairs), lasting, float(alpha), predictors)
     return Monitor(twin, disturbance, scores, slack, steps, arl, *more)
+
+
+def _black_box(healthy: Trajectories) -> object:
+    """What stands for a twin where there is none."""
+    if len(healthy.inputs):
+        return fit_black_box(healthy, "arx").twin
+    return fit_levels(healthy).twin
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,6 +33,7 @@ from retwin.monitor.detect.validity import Validity
 from retwin.monitor.models.monitor_state import MonitorState
 from retwin.monitor.models.parts import Part, Streams
 from retwin.monitor.models.saved import read_fields, write_fields
+from retwin.monitor.models.visible import Visible
 from retwin.monitor.models.watched import Alarm, Ending, Watched
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.online import OnlineFilter
@@ -78,6 +79,8 @@ class Monitor:
         Probability of declaring a promise void that applies.
     predictors : tuple of Predictor
         The M predictive models.
+    visible : tuple of Visible
+        What is seen of faults, of `visible_sizes`; empty where that was not tried.
 
     """
 
@@ -92,6 +95,7 @@ class Monitor:
     lasting: float = 3600.0
     alpha: float = 0.01
     predictors: tuple[Predictor, ...] = (Predictor(),)
+    visible: tuple[Visible, ...] = ()
 
     @property
     def warm_up(self) -> float:

@@ -16,6 +16,7 @@ from retwin.monitor.detect.predictors import Predictor
 from retwin.monitor.detect.promise import Tried
 from retwin.monitor.detect.scores import ConformalScores
 from retwin.monitor.detect.slack import Slack
+from retwin.monitor.models.visible import Visible
 from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.update.dynamics.twin import DynamicsTwin
 
@@ -37,6 +38,7 @@ def write_fields(folder: str | Path, fields: Mapping[str, Any]) -> None:
         "copies": scores.copies,
         "predictors": [[each.process, each.warm_up, each.effect] for each in predictors],
         "tried": vars(fields["tried"]),
+        "visible": [vars(each) for each in fields["visible"]],
         **{name: fields[name] for name in NUMBERS},
     }
     arrays = {name: getattr(fields["disturbance"], name) for name in DISTURBANCE}
@@ -90,5 +92,6 @@ def read_fields(folder: str | Path) -> dict[str, Any]:
             "noise": noise,
             "tried": Tried(**about["tried"]),
             "predictors": predictors,
+            "visible": tuple(Visible(**each) for each in about["visible"]),
             **{name: finite(name, about[name], least=0.0) for name in NUMBERS},
         }

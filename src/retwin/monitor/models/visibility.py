@@ -1,0 +1,152 @@
+"""What a monitor sees: sizes of faults that raise an alarm nine times of ten within a stated time.
+
+The effect of a fault is that which the twin simulates, added to healthy records as they were
+measured, and the monitor watches the sum. So noise and dependence are those of the machine.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.trajectories import Trajectories
+from retwin.monitor.models.monitor import Monitor
+from retwin.monitor.models.visible import SHARE, Visible
+from retwin.twins.collected import SimulationError
+from retwin.twins.faults.actuator_faults import Fault, Stuck
+from retwin.twins.faults.system_faults import (
+    SensorError,
+    SensorFreeze,
+    SizedFault,
+    TimedFault,
+    measured_with,
+)
+from retwin.twins.twin import check_channels
+
+ONSETS = 20
+"""Onsets that are tried of each fault and size, at most."""
+LONGER = 10
+"""Samples within which an alarm counts, over those in which a shift by one deviation is seen."""
+HALVINGS = 5
+"""Times that the largest size is halved, at most."""
+
+
+def visible_sizes(
+    monitor: Monitor, healthy: Trajectories, faults: Mapping[str, Fault | None]
+) -> list[Visible]:
+    """Which faults the monitor sees, and from what size on.
+
+    Parameters
+    ----------
+    monitor : Monitor
+        The monitor.
+    healthy : Trajectories
+        Healthy records of the machine, to which the effects of faults are added.
+    faults : mapping of str to Fault or None
+        The faults, such as `possible_causes`; of those that have no onset nothing is said. The
+        largest size of a range is halved until it is not seen any more.
+
+    Raises
+    ------
+    InputError
+        Other channels or another rate than those of the twin.
+
+    """
+    check_channels(monitor.twin, healthy, "healthy")
+    windows = _windows(monitor, healthy)
+    within = (windows.steps - windows.lead) / healthy.rate
+    made = []
+    for name, fault in faults.items():
+        if not isinstance(fault, TimedFault | Stuck):
+            continue
+        largest = _largest(fault)
+        sizes = [None] if largest is None else [largest / 2**i for i in range(HALVINGS + 1)]
+        best, share = None, np.nan
+        for size in sizes:
+            now = _share(monitor, windows, fault, size)
+            if now < SHARE:
+                share = share if best is not None else now
+                break
+            if now >= SHARE:
+                best, share = size, now
+        if np.isfinite(share):  # of a fault that the twin can simulate
+            made.append(Visible(name, best, largest, share, within))
+    return made
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Parts of healthy records: of which one each is, and its first sample."""
+
+    healthy: Trajectories
+    record: NDArray
+    first: NDArray
+    lead: int
+    steps: int
+
+    def cut(self, values: NDArray, *, by_record: bool = True) -> NDArray:
+        """The parts (n, steps, ...) of values of each record, or of each window."""
+        rows = self.record if by_record else range(len(self.first))
+        pairs = zip(rows, self.first, strict=True)
+        return np.stack([values[row, first : first + self.steps] for row, first in pairs])
+
+
+def _windows(monitor: Monitor, healthy: Trajectories) -> _Windows:
+    """Parts that begin evenly in the records, with the number of samples before the onset."""
+    wanted = monitor.rules.wanted
+    lead = round(monitor.warm_up * monitor.twin.rate) + wanted
+    count = healthy.mask.any(axis=2).sum(axis=1)
+    steps = min(lead + LONGER * wanted, max(int(count.max()) // 2, 2))
+    lead = min(lead, steps // 2)
+    starts = [
+        (i, first)
+        for i in range(len(healthy))
+        for first in range(0, int(count[i]) - steps + 1, max(1, steps // 8))
+    ]
+    even = np.linspace(0, len(starts) - 1, min(ONSETS, len(starts)))
+    chosen = np.array(starts)[even.round().astype(int)]
+    return _Windows(healthy, chosen[:, 0], chosen[:, 1], lead, steps)
+
+
+def _largest(fault: TimedFault | Stuck) -> float | None:
+    """The size of a fault that is farthest from 0."""
+    if not isinstance(fault, SizedFault):
+        return None
+    return float(max(np.atleast_1d(fault.size), key=abs))
+
+
+def _share(
+    monitor: Monitor, windows: _Windows, fault: TimedFault | Stuck, size: float | None
+) -> float:
+    """The share of windows with an alarm after the onset; NaN if it cannot be simulated."""
+    changed: dict[str, Any] = ({} if size is None else {"size": size}) | (
+        {"end": None} if isinstance(fault, TimedFault) else {}
+    )
+    rate, healthy = windows.healthy.rate, windows.healthy
+    faults = [
+        replace(fault, onset=(first + windows.lead) / rate, **changed) for first in windows.first
+    ]
+    observed, commands = healthy.observed[windows.record], healthy.commands[windows.record]
+    if isinstance(fault, SensorError | SensorFreeze):
+        observed = measured_with(observed, faults, rate)
+    else:
+        with warnings.catch_warnings():  # of ranges, which faults may leave
+            warnings.simplefilter("ignore")
+            try:
+                faulty, calm = (
+                    monitor.twin.simulate(commands, faults=each, seed=0).observed
+                    for each in (faults, None)
+                )
+            except SimulationError:
+                return np.nan
+        observed = observed + (faulty - calm)
+    seen = windows.cut(healthy.mask)
+    measured = np.where(seen, windows.cut(observed, by_record=False), np.nan)
+    state = monitor.start(len(measured))
+    watched = monitor.step(state, windows.cut(healthy.commands), measured)[1]
+    return float(watched.alarm[:, windows.lead :].any(axis=1).mean())

@@ -1,0 +1,43 @@
+"""What is seen of a fault."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SHARE = 0.9
+"""Share of onsets after which a fault must have raised an alarm."""
+
+
+@dataclass(frozen=True)
+class Visible:
+    """What is seen of a fault.
+
+    Attributes
+    ----------
+    fault : str
+        Its name.
+    size : float or None
+        The smallest size of those tried that is seen, and all larger ones are; None where none is,
+        or where the fault has no size.
+    largest : float or None
+        The largest size that was tried; None where the fault has no size.
+    share : float
+        Share of onsets with an alarm in time: at `size`, or else at the largest one.
+    within : float
+        That time in s.
+
+    """
+
+    fault: str
+    size: float | None
+    largest: float | None
+    share: float
+    within: float
+
+    def __str__(self) -> str:
+        """One line for the terminal."""
+        if self.share < SHARE:
+            what = "not seen" if self.largest is None else f"not seen up to {abs(self.largest):.3g}"
+        else:
+            what = "seen" if self.size is None else f"seen from {abs(self.size):.3g} on"
+        return f"{self.fault}: {what} ({self.share:.0%} within {self.within:.3g} s)"
