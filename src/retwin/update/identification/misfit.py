@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pebble import ProcessPool
 
-from retwin.checks import instance, require, whole
+from retwin.checks import require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
@@ -223,8 +223,13 @@ def _in_worker(
 
 def _check_data(twin: ParametricTwin, observed: Trajectories, rate: float | None) -> int:
     """The stride of the residuals; InputError if twin and data do not fit each other."""
-    remedy = "declare its free parameters: see ParametricTwin, CommandSide and ParametricTwin.built"
-    instance("twin", twin, ParametricTwin, remedy=remedy)
+    require(
+        isinstance(twin, ParametricTwin),
+        "twin",
+        expected="a ParametricTwin, which declares its free parameters",
+        got=type(twin).__name__,
+        remedy="see ParametricTwin, CommandSide and ParametricTwin.built",
+    )
     stride = checked_stride(twin, observed, rate, "observed")
     count = int(observed.mask[:, ::stride].sum())
     require(
