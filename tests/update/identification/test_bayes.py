@@ -208,7 +208,7 @@ def test_bad_input_is_named(observed: rt.Trajectories, monkeypatch: pytest.Monke
             call()
     for name, method in {"emcee": MCMC(noise=WHITE), "sbi.neural_nets": NPE(noise=WHITE)}.items():
         monkeypatch.setitem(sys.modules, name, None)
-        with pytest.raises(rt.InputError, match=r"retwin\[bayes\]"):
+        with pytest.raises(rt.InputError, match=r"pip install .*\[bayes\]"):
             identify(FAST, observed, method, seed=0)
 
 
