@@ -153,5 +153,5 @@ def _share(
     state = monitor.start(len(measured))
     alarm = monitor.step(state, windows.cut(healthy.commands), measured)[1].alarm
     # What alarms before the onset alarms again while its event lasts.
-    calm = ~alarm[:, : windows.lead].any(axis=1)
-    return float(alarm[calm, windows.lead :].any(axis=1).mean()) if calm.any() else np.nan
+    quiet = np.flatnonzero(~alarm[:, : windows.lead].any(axis=1))
+    return float(alarm[quiet, windows.lead :].any(axis=1).mean()) if len(quiet) else np.nan
