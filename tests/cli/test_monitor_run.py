@@ -82,7 +82,8 @@ def rows(record: rt.Trajectories, first: int, last: int, begin: float) -> str:
 def test_alarms_and_causes_are_lines_and_a_changed_monitor_is_proposed(
     watched: Path, place: Path, watching
 ) -> None:
-    (place / "monitor.toml").write_text(SETTINGS + FOLDER + SERVER)
+    notify = '[notify.shift]\nfile = "events.jsonl"\n'
+    (place / "monitor.toml").write_text(SETTINGS + FOLDER + SERVER + notify)
     (place / "token").write_text("a token of many characters")
     leak, begin = rt.load(watched / "leak.npz"), round(time.time()) - 1000
     log = place / "logs" / "tank1.csv"
@@ -102,6 +103,10 @@ def test_alarms_and_causes_are_lines_and_a_changed_monitor_is_proposed(
     assert alarm.startswith("tank1: ALARM ")
     assert "level, lower than predicted" in alarm
     assert "leaking from" in next(line for line in lines if "cause of alarm" in line)
+    written = (place / "events.jsonl").read_text().splitlines()
+    told = [json.loads(line)["text"] for line in written]
+    assert told[0] == alarm
+    assert "leaking from" in told[1]
     with Store(place / "store", read_only=True) as store:
         stored = sum(len(times) for times, _ in store.samples("tank1"))
     assert stored == 330

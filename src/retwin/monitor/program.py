@@ -7,7 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from datetime import UTC, datetime
+from datetime import time
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,13 @@ from retwin.errors import InputError
 from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.gate import Gate
 from retwin.monitor.live.live import Live
-from retwin.monitor.models.cause import cause_text, cause_title
+from retwin.monitor.live.notifications import (
+    AppriseChannel,
+    FileChannel,
+    Notifications,
+    Receiver,
+)
+from retwin.monitor.live.sentences import sentence
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
 from retwin.monitor.models.trajectories import TrajectoryMonitor
 from retwin.monitor.server import create_app, listening, serving
@@ -28,6 +34,7 @@ from retwin.monitor.settings import (
     FolderSource,
     MonitorSettings,
     MqttSource,
+    NotifySettings,
     ServerSettings,
     TwinSettings,
     secret,
@@ -39,15 +46,11 @@ from retwin.monitor.sources.opcua import OpcUa
 from retwin.monitor.sources.source import Source
 from retwin.monitor.sources.tables import Layout
 from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
-from retwin.monitor.store.audit import Entry
-from retwin.monitor.store.samples import SECOND
 from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 from retwin.serialisation.files import sha256
 from retwin.twins.faults.actuator_faults import Fault
 
-REMEDY = "If it is healthy, recalibrate: what follows are remarks, and no alarms, until then"
-"""What to do where a promise is void."""
 INTERVAL = 0.5
 """Seconds after which new entries of the log are reported."""
 
@@ -92,6 +95,8 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
         systems = {name: _case(settings.twins[name], each) for name, each in twins.items()}
         explanations = Explanations(live, lambda twin: _faults(systems.get(twin)))
         opened.enter_context(explanations)
+        receivers = [_receiver(name, each) for name, each in settings.notify.items()]
+        opened.enter_context(Notifications(store, receivers, report))
         gate = opened.enter_context(Gate(live))
         sources = [
             source
@@ -120,42 +125,6 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
             news.read()
 
 
-def described(entry: Entry) -> str:
-    """An entry of the log in a line; "" for one that is not reported."""
-    data = entry.data
-    if entry.kind == "version":
-        reason = f": {data['reason']}" if data.get("reason") else ""
-        return f"twin {data['twin']}: {data['step']} version {data['version']}{reason}"
-    if entry.kind == "cause":
-        onset = data["onset"][0]
-        if data.get("same"):
-            return ""  # the event has its cause
-        found = cause_text(data["name"], "" if onset is None else _moment(onset), data["unknown"])
-        text = f"cause of alarm {data['alarm']}: {found}"
-        return f"{data['asset']}: {text} (probability {data['probability']:.2f})"
-    texts = {
-        "alarm": "ALARM {sequence}: {output}, {change}",
-        "remark": "remark, for which nothing is promised: {output}, {change}",
-        "end": "event ended, {how}",
-        "void": "promise VOID: the machine is not the one of the calibration. " + REMEDY,
-        "event": "{text}",
-    }
-    opens = data.get("event", data.get("time")) == data.get("time")
-    if entry.kind not in texts or not (opens or entry.kind == "end"):
-        return ""  # an event is one line, though more alarms belong to it
-    text = texts[entry.kind].format(sequence=entry.sequence, **data)
-    if "cause" in data:
-        name, probability = cause_title(data["cause"]["name"]), data["cause"]["probability"]
-        text += f", cause: {name}, probability {probability:.2f}"
-    return f"{data['asset']}: {text} ({_moment(data['time'])})"
-
-
-def _moment(time: int) -> str:
-    """A time in ns, to the second."""
-    moment = datetime.fromtimestamp(time // SECOND, UTC)
-    return moment.isoformat().replace("+00:00", "Z")
-
-
 class _News:
     """Reports the entries that are new in the log."""
 
@@ -170,7 +139,7 @@ class _News:
         """Report them; a store that cannot be read is reported once, and read again later."""
         try:
             for entry in self._store.log(after=self._last):
-                line = described(entry)
+                line = sentence(entry)
                 if line:
                     self._report(line)
                 self._last = entry.sequence
@@ -206,6 +175,14 @@ def _bound(server: ServerSettings) -> socket.socket:
 
 def _token(server: ServerSettings) -> str | None:
     return secret("token", server.token_env, server.token_file)
+
+
+def _receiver(name: str, settings: NotifySettings) -> Receiver:
+    """Who is notified, as the settings state it."""
+    address = secret("address", settings.url_env)
+    channel = AppriseChannel(address) if address else FileChannel(settings.file)  # type: ignore[arg-type]
+    quiet = [tuple(map(time.fromisoformat, each.split("-"))) for each in settings.quiet]
+    return Receiver(name, channel, settings.kinds, settings.assets, quiet)  # type: ignore[arg-type]
 
 
 def _sources(

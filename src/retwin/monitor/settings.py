@@ -160,6 +160,34 @@ class ServerSettings(Part):
     """File with the token instead."""
 
 
+Kind = Literal["alarm", "remark", "cause", "end", "void", "event", "version"]
+"""Kinds of entries of the log of which a line is reported."""
+Span = Annotated[str, Field(pattern=r"^([01]\d|2[0-3]):[0-5]\d-([01]\d|2[0-3]):[0-5]\d$")]
+
+
+class NotifySettings(Part):
+    """Who hears of events: once each, and later where it cannot be reached at once."""
+
+    url_env: str | None = None
+    """Variable of the environment with the address as Apprise writes it: mailto://, slack://,
+    json:// for a webhook, and others."""
+    file: Beside | None = None
+    """File to which a line of JSON is appended instead."""
+    kinds: list[Kind] = Field(default=["alarm", "cause", "end", "void"])
+    """What is sent: the begin of an event, its cause and each change of it, its end, and that the
+    promise is void."""
+    assets: list[Name] = Field(default=[])
+    """The machines; by default all."""
+    quiet: list[Span] = Field(default=[])
+    """Times of the day, such as "22:00-06:00", between which nothing is sent, for maintenance."""
+
+    @model_validator(mode="after")
+    def _one_channel(self) -> NotifySettings:
+        if (self.url_env is None) == (self.file is None):
+            raise ValueError("either url_env or file")
+        return self
+
+
 Source = Annotated[FolderSource | MqttSource | OpcUaSource, Field(discriminator="type")]
 
 
@@ -183,6 +211,8 @@ class MonitorSettings(Part):
     """The machines by their names."""
     sources: list[Source] = Field(default=[])
     """Where samples come from, besides those that programs post."""
+    notify: dict[Name, NotifySettings] = Field(default={})
+    """Who hears of events, by their names."""
     server: ServerSettings | None = None
     """The page; none without this table."""
 
@@ -191,6 +221,10 @@ class MonitorSettings(Part):
         for name, asset in self.assets.items():
             if asset.twin not in self.twins:
                 raise ValueError(f"a table [twins.{asset.twin}], which the asset {name} names")
+        for receiver in self.notify.values():
+            for name in receiver.assets:
+                if name not in self.assets:
+                    raise ValueError(f"a table [assets.{name}], which [notify] names")
         for source in self.sources:
             asked = getattr(source, "asset", None)
             for name in getattr(source, "nodes", [asked] if asked else []):
