@@ -229,7 +229,8 @@ def test_search_equations_and_outputs_are_in_the_site(site: Path) -> None:
     tutorial = (site / "tutorial.html").read_text("utf-8")
     assert "coverage90: 0." in tutorial
     assert "data:image/png;base64," in tutorial
-    assert "<summary>Table</summary>" in (site / "results.html").read_text("utf-8")
+    arm = (site / "results_arm.html").read_text("utf-8")
+    assert "<summary>Table</summary>" in arm
 
 
 @pytest.mark.slow
