@@ -17,7 +17,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from retwin import catalog
@@ -27,7 +26,7 @@ from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase, argument, 
 from retwin.cli.reading import case_named, read, read_signals, saved, shown_records
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.quality.check import check_records
-from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
 
@@ -412,13 +411,12 @@ def _event_rows(
     ends = {(each.trajectory, each.event): each for each in watched.endings}
     rows = []
     for first in watched.events:
-        names, before = [], -np.inf
-        for i, alarm in enumerate(watched.alarms):
-            if (alarm.trajectory, alarm.event) == (first.trajectory, first.event):
-                # A further one is of a second fault if that began after the alarm before.
-                if alarm.opens or (causes[i].name != HEALTHY and causes[i].onset[1] > before):
-                    names.append(_written(causes[i]))
-                before = alarm.time
+        names = [
+            _written(cause)
+            for cause in causes
+            if (cause.alarm.trajectory, cause.alarm.event) == (first.trajectory, first.event)
+            and not cause.same
+        ]
         end = ends.get((first.trajectory, first.event))
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
