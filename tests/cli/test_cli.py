@@ -67,7 +67,8 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
     assert first["probability"] == max(first["probabilities"].values())
     assert list(first["probabilities"]) == list(rt.cases.armpi().classes)
     code, out, err = call(
-        "diagnose", "invert", tmp_path / "model", files / "real.npz", "--out", tmp_path / "physics"
+        *("diagnose", "fit", files / "real.npz", "--from", tmp_path / "model"),
+        *("--out", tmp_path / "physics"),
     )
     assert code == 0, err
     rt.save(rt.load(files / "real.npz")[[0, 10]], tmp_path / "two.npz")

@@ -22,8 +22,7 @@ from retwin.cli.terminal import _TimeLeft, answer, bar, be_quiet, note, show_war
 from retwin.progress import FinishedStage
 
 WITHOUT_TABLES = {
-    *("data convert", "data split", "data fetch", "twin simulate", "twin animate"),
-    *("diagnose fit", "diagnose invert", "bundle save", "bundle generate", "generate", "report"),
+    *("data convert", "twin simulate", "diagnose fit", "bundle save", "generate", "report"),
     "monitor run",
 }
 """Commands that print a line at most; all others have --json."""
@@ -76,9 +75,8 @@ def test_the_help_of_a_command_fits_50_lines(narrow, name: str) -> None:
 
 
 RECORDED = (
-    *("data info", "data convert", "data split", "identify", "fit", "next", "study"),
-    *("diagnose fit", "diagnose invert", "diagnose predict", "bundle save", "bundle predict"),
-    *("monitor fit", "monitor replay"),
+    *("data info", "data convert", "identify", "fit", "generate", "next", "study"),
+    *("diagnose fit", "diagnose predict", "bundle save", "monitor fit", "monitor replay"),
 )
 """Commands that take recorded data, which may be a log."""
 
@@ -139,7 +137,7 @@ def test_json_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_json_is_alone_on_stdout(narrow) -> None:
-    code, out, err = narrow("twin", "list", "--json")
+    code, out, err = narrow("twin", "info", "--json")
     assert (code, err) == (0, "")
     printed = json.loads(out)
     assert printed.keys() == {"built_in", "forms"}

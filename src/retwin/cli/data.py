@@ -1,4 +1,4 @@
-"""`retwin data`: describe, map, convert, split and fetch trajectories."""
+"""`retwin data`: describe, map and convert trajectories."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.table import Table
 
-from retwin.checks import ends_in, nothing, require
+from retwin.catalog import DOWNLOADS
+from retwin.checks import at_least, ends_in, nothing
 from retwin.cli.commands import Commands
-from retwin.cli.completion import complete_files
 from retwin.cli.options import (
     CaseOption,
     Inputs,
@@ -26,7 +26,7 @@ from retwin.cli.options import (
     channel_names,
     option,
 )
-from retwin.cli.reading import data_case, read, shown_records
+from retwin.cli.reading import data_case, read, read_all, shown_records
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
 from retwin.data.io import DataCase, check_target, save
@@ -45,11 +45,9 @@ SHOWN = 40
 """Signals of a log that are listed."""
 
 app = Commands(
-    help="Describe, map, convert, split and fetch trajectories.",
+    help="Describe, map and convert trajectories.",
     epilog=example("retwin data info real.mat --case armpi"),
 )
-
-File = Annotated[Path, argument("FILE", "File or folder of trajectories.", show_default=False)]
 
 ChannelsOf = Annotated[
     str | None,
@@ -140,70 +138,46 @@ def map_log(
 
 @app.command(epilog=example("retwin data convert sim.mat sim.npz --case armpi"))
 def convert(
-    source: Annotated[Path, argument("IN", "File or folder to read.")],
-    target: Annotated[Path, argument("OUT", "New *.npz or *.zarr.")],
-    case: CaseOption = None,
-    rate: Rate = None,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
-) -> None:
-    """Write trajectories in retwin's own format, with channels, rate and provenance."""
-    check_target(target)
-    trajectories = read(source, data_case(case), rate, max_bytes=max_bytes, mapping=mapping)
-    save(trajectories, target)
-    note(f"Wrote {target}: {trajectories}")
-
-
-@app.command(epilog=example("retwin data split real.npz --out-first fit.npz --out-second test.npz"))
-def split(
-    file: File,
-    first: Annotated[Path, option("FILE", "First part, *.npz or *.zarr.", "--out-first")],
-    second: Annotated[Path, option("FILE", "The rest, *.npz or *.zarr.", "--out-second")],
-    fraction: Annotated[float, option("X", "Share of the first part.")] = 0.6,
+    files: Annotated[
+        list[Path], argument("IN… OUT", "Files or folders to read, and a new *.npz or *.zarr.")
+    ],
+    public: Annotated[
+        str | None,
+        option("NAME", "Read a public data file, such as armpi.", names=sorted(DOWNLOADS)),
+    ] = None,
+    split: Annotated[
+        float | None, option("SHARE", "Of each class to OUT; the rest goes to OUT-rest.")
+    ] = None,
     seed: Seed = 0,
     case: CaseOption = None,
     rate: Rate = None,
     mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
 ) -> None:
-    """Split trajectories in two, at random, with the same shares of every class."""
-    for target in (first, second):
-        check_target(target)
-    require(
-        first.resolve() != second.resolve(),
-        "--out-second",
-        expected="another name than --out-first",
-        got=second,
-        remedy="give each part its own file",
-    )
-    whole = read(file, data_case(case), rate, max_bytes=max_bytes, mapping=mapping)
-    parts = whole.split(fraction, seed=seed)
-    for part, target in zip(parts, (first, second), strict=True):
-        save(part, target)
-        note(f"Wrote {target}: {part}")
+    """Write trajectories in retwin's own format, with channels, rate and provenance.
 
-
-@app.command(epilog=example("retwin data fetch armpi --folder data"))
-def fetch(
-    name: Annotated[
-        str,
-        argument(
-            "NAME", "Name of a public data file, such as armpi.", autocompletion=complete_files
-        ),
-    ],
-    folder: Annotated[
-        Path | None, option("FOLDER", "Else RETWIN_CACHE, else the user's cache.")
-    ] = None,
-    max_bytes: Annotated[
-        int, option("N", "Most that the file may hold.", min=1)
-    ] = download.MAX_BYTES,
-) -> None:
-    """Download a public data file, check its SHA-256 and print its path."""
-    with bar("fetch") as show:
-        path = download.fetch(
-            name, folder=folder, progress=lambda share: show(name, share), max_bytes=max_bytes
-        )
-    answer(path, str(path))
+    A public file is downloaded to RETWIN_CACHE, else the user's cache, and its
+    SHA-256 is checked.
+    """
+    *sources, target = files
+    targets = [target] if split is None else [target, target.with_stem(f"{target.stem}-rest")]
+    for each in targets:
+        check_target(each)
+    if public is not None:
+        with bar("fetch") as show:
+            sources.append(
+                download.fetch(
+                    public,
+                    progress=lambda share: show(public, share),
+                    max_bytes=max_bytes or download.MAX_BYTES,
+                )
+            )
+    at_least("IN", sources, 1, "file", remedy="name it before OUT, or give --public NAME")
+    found = read_all(sources, data_case(case or public), rate, max_bytes=max_bytes, mapping=mapping)
+    parts = [found] if split is None else found.split(split, seed=seed)
+    for part, place in zip(parts, targets, strict=True):
+        save(part, place)
+        note(f"Wrote {place}: {part}")
 
 
 def _channels_of(

@@ -20,11 +20,12 @@ from retwin.cli.options import (
     OtherCase,
     PerClass,
     Seed,
+    argument,
     option,
     seconds_of,
 )
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import read_all, read_commands, system_of, updated_twin
+from retwin.cli.reading import read_all, read_commands, source_of, system_of, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import Trajectories
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def generate(
-    model: Model,
+    model: Annotated[Path, argument("MODEL", "Folder of a corrected twin, or of a bundle.")],
     out: Annotated[Path, option("FILE", "New *.npz, or *.zarr of any size; *.csv of bands.")],
     commands: Annotated[
         Path | None, option("FILE", "Simulate these commands, in place of drawn ones.")
@@ -69,13 +70,12 @@ def generate(
         _write_bands(model, commands, out, case, seed, mapping)  # type: ignore[arg-type]
         return
     kind = check_target(out)
-    updated = updated_twin(model)
+    updated, system = source_of(model, case)
     if commands is not None:
-        records = read_commands(commands, system_of(updated, model, case), mapping=mapping)
+        records = read_commands(commands, system, mapping=mapping)
         rt.save(updated.simulate(records.commands.astype(float), seed=seed), out)
         note(f"Wrote {len(records)} trajectories to {out}")
         return
-    system = system_of(updated, model, case)
     if kind == ".zarr" or workers is not None:
         n = per_class * len(system.faults)
         plan = rt.deploy.SimulationPlan(updated, system.sampler, seed, n, system.faults)
@@ -95,8 +95,8 @@ def _write_bands(
     """Mean and quantiles of every sample of given commands, as a table."""
     from retwin.evaluation import predict_records
 
-    updated = updated_twin(model)
-    records = read_commands(commands, system_of(updated, model, case), mapping=mapping)
+    updated, system = source_of(model, case)
+    records = read_commands(commands, system, mapping=mapping)
     write_predictions(predict_records(updated, records, seed=seed), records, out)
     note(f"Wrote mean and 90 % bands of {len(records)} records to {out}")
 

@@ -23,7 +23,7 @@ import typer
 from retwin import catalog
 from retwin.checks import at_least, finite, positive, require
 from retwin.cli.commands import Commands
-from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase, argument, option
+from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase, argument, leave_out, option
 from retwin.cli.reading import case_named, read, read_signals, saved, shown_records
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.quality.check import check_records
@@ -38,6 +38,7 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
 
 EVENT = ("file", "record", "from s", "to s", "what", "cause")
 """What is shown of an event."""
+CONFIG = Path("monitor.toml")
 Reading = Callable[..., Trajectories]
 """`cli.reading.read` with the options of the command."""
 
@@ -79,13 +80,7 @@ def fit(
     healthy = files[1:] if model else files
     at_least("FILE", healthy, 1, "file", remedy="name healthy records after the model")
     if model and kind_of(saved(model)) in catalog.DIAGNOSERS:
-        require(
-            lasting is None,
-            "lasting",
-            expected="none for a diagnoser, whose monitor watches whole trajectories",
-            got=lasting,
-            remedy="leave it out",
-        )
+        leave_out({"--lasting": lasting}, "for a diagnoser, which watches whole trajectories")
         _fit_trajectories(model, healthy, out, false_alarms, case, reading, as_json)
         return
     known = DynamicsTwin.load(model) if model else None
@@ -237,22 +232,53 @@ def _replay_trajectories(
     )
 
 
-@app.command(epilog=example("retwin monitor demo --open"))
-def demo(
-    port: Annotated[int, option("N", "Of the page; 0 is any free one.", min=0, max=65535)] = 8710,
+@app.command(epilog=example("retwin monitor run --config monitor.toml"))
+def run(
+    config: Annotated[Path, option("FILE", "Machines, twins and sources.")] = CONFIG,
+    demo: Annotated[
+        bool, option("", "Watch emulated incubators, of which some become faulty.", "--demo")
+    ] = False,
+    port: Annotated[
+        int | None, option("N", "Of the demo's page; else 8710; 0: any.", min=0, max=65535)
+    ] = None,
+    open_page: Annotated[bool, option("", "Open the demo's page in a browser.", "--open")] = False,
     seconds: Annotated[float | None, option("S", "End by itself after this time.")] = None,
-    open_page: Annotated[bool, option("", "Open the page in a browser.", "--open")] = False,
-    as_json: Json = False,
 ) -> None:
-    """Show the live monitor with emulated incubators, of which some become faulty.
+    """Watch running machines, until Ctrl-C or SIGTERM.
 
-    They run 60 times as fast as real ones. Everything is removed at the end.
+    The incubators of --demo run 60 times as fast as real ones; nothing of them is
+    kept.
     """
+    if seconds is not None:
+        finite("seconds", positive("seconds", seconds, unit="s"), most=threading.TIMEOUT_MAX)
+    if demo:
+        leave_out({"--config": None if config == CONFIG else config}, "with --demo")
+        _demonstrate(8710 if port is None else port, open_page, seconds)
+        return
+    leave_out({"--port": port, "--open": open_page}, "without --demo")
+    from retwin.monitor.program import run as watch
+    from retwin.monitor.settings import read_settings
+
+    settings, stop = read_settings(config), threading.Event()
+    end = threading.Timer(seconds or 0.0, stop.set)
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+    try:
+        if seconds is not None:
+            end.start()
+        watch(settings, lambda line: answer(None, line), stop)
+    finally:
+        end.cancel()
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+    note("Stopped; everything that was acknowledged is stored.")
+
+
+def _demonstrate(port: int, open_page: bool, seconds: float | None) -> None:
+    """Show the live monitor with emulated machines, for so long or until Ctrl-C."""
     from retwin.monitor.demo import announced, demonstration
     from retwin.monitor.server import create_app, listening, serving
 
-    if seconds is not None:
-        finite("seconds", positive("seconds", seconds, unit="s"), most=threading.TIMEOUT_MAX)
     token = secrets.token_urlsafe()
     for line in announced():
         note(line)
@@ -267,39 +293,13 @@ def demo(
         app = create_app(live, gate, token=token, explanations=explanations, emulated=True)
         running.enter_context(serving(app, bound))
         address = f"http://127.0.0.1:{bound.getsockname()[1]}/"
-        answer(
-            {"address": address, "token": token},
-            f"Page: {address}",
-            f"Token, for changes on the page: {token}",
-            as_json=as_json,
-        )
+        answer(None, f"Page: {address}", f"Token, for changes on the page: {token}")
         note(f"It ends {'' if seconds is None else f'after {seconds:g} s, or '}with Ctrl-C.")
         if open_page:
             webbrowser.open(address)
         with suppress(KeyboardInterrupt):
             threading.Event().wait(seconds)
     note("The demonstration has ended; nothing of it is kept.")
-
-
-@app.command(epilog=example("retwin monitor run --config monitor.toml"))
-def run(
-    config: Annotated[Path, option("FILE", "Machines, twins and sources, as TOML.")] = Path(
-        "monitor.toml"
-    ),
-) -> None:
-    """Watch running machines, until Ctrl-C or SIGTERM."""
-    from retwin.monitor.program import run as watch
-    from retwin.monitor.settings import read_settings
-
-    settings, stop = read_settings(config), threading.Event()
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
-    try:
-        watch(settings, lambda line: answer(None, line), stop)
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-    note("Stopped; everything that was acknowledged is stored.")
 
 
 @app.command(epilog=example("retwin monitor audit store"))

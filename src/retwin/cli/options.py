@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from retwin.catalog import CASES
-from retwin.checks import positive, whole
+from retwin.checks import positive, require, whole
 from retwin.cli.completion import one_of
 
 
@@ -36,6 +36,10 @@ def option(
     if names is not None:
         more["autocompletion"] = one_of(names)
     return typer.Option(*flags, metavar=metavar or None, help=text, **more)
+
+
+rare = partial(option, rich_help_panel="Rarely needed")
+"""An option that few users need, in the second panel of the help; see `option`."""
 
 
 def argument(metavar: str, text: str, *, names: Iterable[str] | None = None, **more: Any) -> Any:
@@ -66,7 +70,7 @@ Inputs = Annotated[
 Outputs = Annotated[
     str, option("NAMES", "Of the outputs, joined by commas.", "--outputs", rich_help_panel=TWIN)
 ]
-MaxBytes = Annotated[int | None, option("N", "Limit of a file; else by what is free.", min=1)]
+MaxBytes = Annotated[int | None, rare("N", "Limit of a file; else what is free.", min=1)]
 MAX_SEED = 2**63 - 1
 """The largest seed that every generator of random numbers takes."""
 Seed = Annotated[
@@ -84,6 +88,13 @@ Json = Annotated[bool, option("", "Print JSON instead, and nothing else.", "--js
 Horizon = Annotated[
     str, option("TIME", "Judge by predictions so far ahead: 1s, free.", "--horizon")
 ]
+
+
+def leave_out(options: Mapping[str, object], when: str) -> None:
+    """Refuse options that have no meaning `when`; None and False are those that were not given."""
+    for name, value in options.items():
+        absent = value is None or value is False
+        require(absent, name, expected=f"none {when}", got=value, remedy="leave it out")
 
 
 def seconds_of(option: str, text: str) -> float | None:

@@ -14,12 +14,15 @@ from retwin.checks import existing, given
 from retwin.cli.terminal import bar, note, table
 from retwin.data.io import DataCase, load
 from retwin.data.trajectories import Trajectories
+from retwin.serialisation.models import kind_of
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from retwin.cases.case import Case
     from retwin.data.quality.check import Checked
+    from retwin.deploy.bundle.bundle import Bundle
+    from retwin.deploy.onnx.portable import Portable
     from retwin.update import CorrectedTwin, DynamicsTwin
 
 
@@ -60,6 +63,41 @@ def updated_twin(folder: Path) -> CorrectedTwin | DynamicsTwin:
     from retwin.update import load_twin
 
     return load_twin(saved(folder))
+
+
+def is_sealed(folder: Path) -> bool:
+    """Whether the folder is a bundle, or the ONNX export of one."""
+    from retwin.deploy.bundle.seal import SCHEMAS, SUMS
+
+    return kind_of(folder) in SCHEMAS or (folder / SUMS).exists()
+
+
+def open_sealed(folder: Path) -> Bundle | Portable:
+    """The bundle, or its export, for which torch is not imported."""
+    from retwin.deploy.bundle.seal import read_sealed
+
+    if read_sealed(folder, "bundle", "portable")["kind"] == "portable":
+        from retwin.deploy.onnx.portable import Portable
+
+        return Portable.load(folder)
+    from retwin.deploy.bundle.bundle import Bundle
+
+    return Bundle.load(folder)
+
+
+def source_of(folder: Path, name: str | None) -> tuple[CorrectedTwin | DynamicsTwin, Case]:
+    """The updated twin of a saved model or bundle, and its case or the one of that name."""
+    if not is_sealed(saved(folder)):
+        updated = updated_twin(folder)
+        return updated, system_of(updated, folder, name)
+    from retwin import cases
+    from retwin.deploy.bundle.bundle import Bundle
+
+    bundle = Bundle.load(folder)
+    # Only built-in names: code that a file names is not run, so other cases are given by --case.
+    if name is None and bundle.facts.sampler is None and bundle.facts.case.isidentifier():
+        name = bundle.facts.case
+    return bundle.twin, bundle.case if name is None else cases.get(name)
 
 
 def read(
@@ -121,12 +159,13 @@ def read_signals(files: Sequence[Path], max_bytes: int | None = None) -> Traject
 def read_all(
     files: Sequence[Path],
     case: DataCase | None = None,
+    rate: float | None = None,
     *,
     max_bytes: int | None = None,
     mapping: Path | None = None,
 ) -> Trajectories:
     """The trajectories of all files together."""
-    sets = [read(file, case, max_bytes=max_bytes, mapping=mapping) for file in files]
+    sets = [read(file, case, rate, max_bytes=max_bytes, mapping=mapping) for file in files]
     return sets[0] if len(sets) == 1 else Trajectories.concatenate(sets)
 
 
