@@ -231,6 +231,16 @@ def test_a_warning_has_a_line_of_its_own_while_a_bar_is_shown(
     assert not re.search(r"left *warning", printed), "the bar is erased before it"
 
 
+def test_a_warning_is_shown_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with show_warnings():
+        for _ in range(3):
+            warnings.warn("its reset does not restore the initial state", stacklevel=1)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+        warnings.warn("another", stacklevel=1)
+    assert capsys.readouterr().err.count("warning: ") == 2
+
+
 def test_quiet_leaves_out_bars_and_notes(on_screen, capsys: pytest.CaptureFixture[str]) -> None:
     be_quiet(True)
     try:

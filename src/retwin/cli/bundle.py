@@ -56,7 +56,7 @@ def save(
     )
     system = rt.cases.get(case or twin.case)
     classifier = None if diagnoser is None else rt.load_diagnoser(diagnoser)
-    calibration = read(real, system, max_bytes=max_bytes, mapping=mapping)
+    calibration = read(real, system, part="calibration", max_bytes=max_bytes, mapping=mapping)
     with bar("bundle") as show:
         guard = fit_guard(twin, system, calibration, seed=seed, progress=lambda s: show("guard", s))
     notes = {"seed": seed, "command": command_given()}

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.table import Table
 
 from retwin.catalog import DOWNLOADS
-from retwin.checks import at_least, ends_in, nothing
+from retwin.checks import at_least, ends_in, given
 from retwin.cli.commands import Commands
 from retwin.cli.options import (
     CaseOption,
@@ -24,12 +26,15 @@ from retwin.cli.options import (
     argument,
     case_option,
     channel_names,
+    leave_out,
     option,
+    rare,
 )
-from retwin.cli.reading import data_case, read, read_all, shown_records
+from retwin.cli.reading import case_named, data_case, read, shown_records
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
 from retwin.data.io import DataCase, check_target, save
+from retwin.data.logs.reading import is_log
 from retwin.data.quality.check import check_records
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.serialisation.files import sha256, write_atomically
@@ -67,7 +72,13 @@ def info(
     as_json: Json = False,
 ) -> None:
     """Describe files: classes, samples, channels, missing values, SHA-256."""
-    system = _channels_of(case, inputs, outputs, mapping)
+    rate_of = None
+    if mapping is None and is_log(files[0]) and files[0].is_file():
+        from retwin.cases import LogReader
+
+        reader = LogReader(max_bytes=max_bytes)
+        rate_of = partial(reader.rate, files[0]) if rate is None else (lambda _: rate)
+    system = _channels_of(case, inputs, outputs, mapping, rate_of)
     facts, shown = [], []
     for file in files:
         found = read(file, system, rate, max_bytes=max_bytes, mapping=mapping)
@@ -82,9 +93,9 @@ def map_log(
     log: Annotated[Path, argument("LOG", "ROS bag, MCAP, Parquet, TDMS, MDF, CSV, …")],
     out: Annotated[Path, option("FILE", "New mapping.toml; its picture beside.")],
     case: ChannelsOf = None,
-    time: Annotated[str, option("COLUMN", "Column of the times, if not found.", "--time")] = "",
+    time: Annotated[str, rare("COLUMN", "Column of the times, if not found.", "--time")] = "",
     rate: Annotated[
-        float | None, option("HZ", "Rows per second, if it has no times.", "--rate")
+        float | None, rare("HZ", "Rows per second, if it has no times.", "--rate")
     ] = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
@@ -103,7 +114,7 @@ def map_log(
         check_place(place)
     if rate is not None:
         rate = sample_rate("--rate", rate)
-    system = _channels_of(case, inputs, outputs, None)
+    system = _channels_of(case, inputs, outputs)
     with bar("map") as show:
         made = propose_mapping(
             log,
@@ -134,6 +145,12 @@ def map_log(
         note(f"No signal that changes was found for {lacking}: name it in {out}")
     for each in remarks:
         note(each)
+    if case is None:
+        commands = ", ".join(made.mapping.commands if made.mapping else ()) or "none"
+        note(
+            f"Commands, by words in names: {commands}; all others are outputs. Move what is sent "
+            f"to the machine to [commands] in {out}, or give --case TWIN"
+        )
 
 
 @app.command(epilog=example("retwin data convert sim.mat sim.npz --case armpi"))
@@ -173,7 +190,7 @@ def convert(
                 )
             )
     at_least("IN", sources, 1, "file", remedy="name it before OUT, or give --public NAME")
-    found = read_all(sources, data_case(case or public), rate, max_bytes=max_bytes, mapping=mapping)
+    found = read(sources, case or public, rate, max_bytes=max_bytes, mapping=mapping)
     parts = [found] if split is None else found.split(split, seed=seed)
     for part, place in zip(parts, targets, strict=True):
         save(part, place)
@@ -181,20 +198,31 @@ def convert(
 
 
 def _channels_of(
-    name: str | None, inputs: str, outputs: str, mapping: Path | None
+    name: str | None,
+    inputs: str,
+    outputs: str,
+    mapping: Path | None = None,
+    rate_of: Callable[[Sequence[str]], float | None] | None = None,
 ) -> DataCase | None:
-    """What files need of the case or the twin of that name, if one is given."""
-    names = [channel_names(each) for each in (inputs, outputs)]
+    """What files need of the case or the twin of that name, if one is given.
+
+    `rate_of` gives the sample rate of channels in a log, for a twin that has none of its own.
+    """
     if name is None:
-        expected = "the twin to which they belong, --case plant.fmu or module:function"
-        remedy = "give --case too, or leave them out"
-        nothing("--inputs, --outputs", (*names[0], *names[1]), expected, remedy=remedy)
+        options = {"--inputs": inputs or None, "--outputs": outputs or None}
+        leave_out(options, "without --case, the twin to which they belong")
         return None
+    names = (channel_names(inputs), channel_names(outputs))
     if Path(name).suffix.lower() not in FILES and ":" not in name and not any(names):
-        return data_case(name)
+        return data_case(name) if rate_of is None else case_named(name)
     from retwin.cases.twin_data import log_case
 
-    return log_case(name, inputs=names[0], outputs=names[1], mapping=mapping)
+    made = log_case(name, *names, mapping=mapping)
+    if rate_of is None or made.rate:
+        return made
+    found = rate_of((*made.inputs.names, *made.outputs.names))
+    rate = given("--rate", found, "a column with the times of the rows", remedy="give --rate HZ")
+    return log_case(name, *names, rate=rate)
 
 
 def _remarks(made: Proposal, tried: Parts | str) -> list[str]:

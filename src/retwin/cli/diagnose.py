@@ -29,7 +29,6 @@ from retwin.cli.options import (
 )
 from retwin.cli.reading import (
     case_named,
-    data_case,
     is_sealed,
     open_sealed,
     read,
@@ -143,7 +142,7 @@ def _invert(
         leave_out({"FILE": real}, "for corrected dynamics, which need none")
         return rt.fit_inversion(updated, None, None, system.faults)
     expected, remedy = "the trajectories on which the twin was calibrated", "name their file"
-    calibration = reading(given("FILE", real, expected, remedy=remedy), system)
+    calibration = reading(given("FILE", real, expected, remedy=remedy), system, part="calibration")
     return rt.fit_inversion(
         updated.surrogate, updated.residual, calibration, system.faults, twin=system.twin
     )
@@ -173,13 +172,13 @@ def predict(
     if is_sealed(saved(model)):
         one_of("--max-faults", max_faults, (1,), remedy="give the folder of an inversion")
         bundle = open_sealed(model)
-        trajectories = reading(data_case(case))
+        trajectories = reading(case)
         made = _by_bundle(bundle, trajectories)
     else:
         from retwin.diagnosis import load_diagnoser
 
         diagnoser = load_diagnoser(model)
-        trajectories = reading(data_case(case))
+        trajectories = reading(case)
         made = _by_diagnoser(diagnoser, trajectories, max_faults)
     answer(
         {

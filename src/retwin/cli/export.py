@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from retwin.checks import require
 from retwin.cli.commands import Commands
-from retwin.cli.options import Json, OtherCase, Seed, argument, channel_names, leave_out, option
+from retwin.cli.options import (
+    Json,
+    OtherCase,
+    Seed,
+    argument,
+    channel_names,
+    leave_out,
+    option,
+    rare,
+)
 from retwin.cli.reading import saved, system_of, updated_twin
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.errors import InputError
@@ -34,7 +43,7 @@ def fmu(
     out: Annotated[Path, option("FILE", "The FMU to write, *.fmu.")],
     version: Annotated[Literal["2.0", "3.0"], option("FMI", "Version of FMI: 2.0 or 3.0.")] = "2.0",
     source_only: Annotated[
-        bool, option("", "Write no binary for this machine.", "--source-only")
+        bool, rare("", "Write no binary for this machine.", "--source-only")
     ] = False,
     case: OtherCase = None,
     as_json: Json = False,
@@ -101,9 +110,9 @@ def actuator(
     period: Annotated[
         float | None, option("S", "Seconds between two steps; else the sample period.")
     ] = None,
-    draws: Annotated[int | None, option("N", "Draws of the discrepancy; else 16384.")] = None,
+    draws: Annotated[int | None, rare("N", "Draws of the discrepancy; else 16384.")] = None,
     torchscript_only: Annotated[
-        bool, option("", "Write no ONNX graph.", "--torchscript-only")
+        bool, rare("", "Write no ONNX graph.", "--torchscript-only")
     ] = False,
     torque: Annotated[
         list[str] | None,
@@ -113,9 +122,7 @@ def actuator(
             "repeat it for equal actuators.",
         ),
     ] = None,
-    history: Annotated[
-        str | None, option("STEPS", "Of --torque, into the past; else 0,1,2.")
-    ] = None,
+    history: Annotated[str | None, rare("STEPS", "Of --torque, into the past; else 0,1,2.")] = None,
     case: OtherCase = None,
     seed: Seed = 0,
     as_json: Json = False,

@@ -22,10 +22,11 @@ from retwin.cli.options import (
     Seed,
     argument,
     option,
+    rare,
     seconds_of,
 )
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import read_all, read_commands, source_of, system_of, updated_twin
+from retwin.cli.reading import read, read_commands, source_of, system_of, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import Trajectories
@@ -123,7 +124,7 @@ def evaluate(
     model: Model,
     real: Annotated[list[Path], option("FILE", "Records it was not fitted to; may be repeated.")],
     horizon: Horizon = "free",
-    warm_up: Annotated[str, option("TIME", "Begin of each record that is not scored, as 5s.")] = "",
+    warm_up: Annotated[str, rare("TIME", "Begin of each record that is not scored, as 5s.")] = "",
     out: Annotated[Path | None, option("FILE", "CSV file of predictions with bands.")] = None,
     case: OtherCase = None,
     seed: Seed = 0,
@@ -140,7 +141,7 @@ def evaluate(
         check_place(out)
     updated = updated_twin(model)
     system = system_of(updated, model, case)
-    records = read_all(real, system, max_bytes=max_bytes, mapping=mapping)
+    records = read(real, system, part="test", max_bytes=max_bytes, mapping=mapping)
     scores = score_model(
         updated, records, horizon=ahead, warm_up=skipped, twin=system.twin, seed=seed
     )

@@ -14,8 +14,7 @@ from dataclasses import replace
 from functools import partial
 from math import isnan
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -23,7 +22,16 @@ import typer
 from retwin import catalog
 from retwin.checks import at_least, finite, positive, require
 from retwin.cli.commands import Commands
-from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase, argument, leave_out, option
+from retwin.cli.options import (
+    Json,
+    LogMapping,
+    MaxBytes,
+    OtherCase,
+    argument,
+    leave_out,
+    option,
+    rare,
+)
 from retwin.cli.reading import case_named, read, read_signals, saved, shown_records
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.quality.check import check_records
@@ -33,6 +41,7 @@ from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
+    from retwin.cases.twin_data import TwinData
     from retwin.monitor import Alarm, Cause, Monitor, Watched
     from retwin.update import DynamicsTwin
 
@@ -89,7 +98,7 @@ def fit(
         records = [read_signals(healthy, max_bytes)]
     else:
         records = [
-            _healthy(reading(file, system or _named(known, file, mapping)), file)
+            _healthy(reading(file, system or _named(known), part="calibration"), file)
             for file in healthy
         ]
     with bar("calibrate") as show:
@@ -143,7 +152,7 @@ def replay(
     system = case_named(case or made.twin.case or None)
     found, rows = [], []
     for file in logs:
-        record = reading(file, system or _named(made.twin, file, mapping))
+        record = reading(file, system or _named(made.twin))
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
         found.append((file, record, watched, causes))
@@ -305,8 +314,8 @@ def _demonstrate(port: int, open_page: bool, seconds: float | None) -> None:
 @app.command(epilog=example("retwin monitor audit store"))
 def audit(
     store: Annotated[Path, argument("STORE", "Folder of the store, or an exported log.")],
-    head: Annotated[str | None, option("HASH", "A former head that was kept elsewhere.")] = None,
-    url: Annotated[str, option("URL", "The PostgreSQL database, if one.")] = "",
+    head: Annotated[str | None, rare("HASH", "A former head that was kept elsewhere.")] = None,
+    url: Annotated[str, rare("URL", "The PostgreSQL database, if one.")] = "",
     as_json: Json = False,
 ) -> None:
     """Verify the log of a store, and the files of its versions."""
@@ -346,7 +355,7 @@ def recalibrate(
     new_normal: Annotated[
         bool, option("", "A change that lasts is no fault but the new normal.", "--new-normal")
     ] = False,
-    url: Annotated[str, option("URL", "The PostgreSQL database, if one.")] = "",
+    url: Annotated[str, rare("URL", "The PostgreSQL database, if one.")] = "",
     as_json: Json = False,
 ) -> None:
     """Propose a monitor of the last quiet hours, in the shadow of the active one."""
@@ -364,10 +373,11 @@ def _tables(files: Sequence[Path]) -> bool:
     return all(each.suffix.lower() == ".csv" for each in files)
 
 
-def _named(twin: DynamicsTwin | None, file: Path, mapping: Path | None) -> Any:
+def _named(twin: DynamicsTwin | None) -> TwinData | None:
     """What `read` takes for a case: the twin by whose channels the columns of a table are named."""
-    wanted = twin is not None and mapping is None and _tables([file])
-    return SimpleNamespace(twin=twin) if wanted else None
+    from retwin.cases.twin_data import TwinData
+
+    return twin and TwinData(twin.inputs, twin.outputs, twin.rate, twin=twin)
 
 
 def _healthy(record: Trajectories, file: Path) -> Trajectories:

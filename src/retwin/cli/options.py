@@ -38,8 +38,10 @@ def option(
     return typer.Option(*flags, metavar=metavar or None, help=text, **more)
 
 
-rare = partial(option, rich_help_panel="Rarely needed")
-"""An option that few users need, in the second panel of the help; see `option`."""
+RARE = "Rarely needed"
+"""The panel of help with the options that few users need."""
+rare = partial(option, rich_help_panel=RARE)
+"""An option in that panel; see `option`."""
 
 
 def argument(metavar: str, text: str, *, names: Iterable[str] | None = None, **more: Any) -> Any:
@@ -54,7 +56,9 @@ case_option = partial(typer.Option, "--case", metavar="CASE", autocompletion=one
 
 CaseArgument = Annotated[str, argument("CASE", CASE, names=CASES)]
 CaseOption = Annotated[str | None, case_option(help=CASE)]
-OtherCase = Annotated[str | None, case_option(help="If another than it was fitted for.")]
+OtherCase = Annotated[
+    str | None, case_option(help="If another than it was fitted for.", rich_help_panel=RARE)
+]
 Model = Annotated[Path, argument("MODEL", "Folder of a corrected twin.")]
 Real = Annotated[Path, argument("REAL", "The trajectories it was calibrated on.")]
 Measured = Annotated[Path, argument("FILE", "Trajectories; labels are not needed.")]
@@ -62,14 +66,8 @@ Probabilities = Annotated[Path | None, option("FILE", "CSV file for all probabil
 PerClass = Annotated[int, option("N", "Trajectories per class.")]
 Rate = Annotated[float | None, option("HZ", "Samples per second, if the file has none.", "--rate")]
 LogMapping = Annotated[Path | None, option("FILE", "What `retwin data map` wrote.", "--mapping")]
-TWIN = "Twin"
-"""The panel of help with the options of a twin that is no case."""
-Inputs = Annotated[
-    str, option("NAMES", "Of the inputs, joined by commas.", "--inputs", rich_help_panel=TWIN)
-]
-Outputs = Annotated[
-    str, option("NAMES", "Of the outputs, joined by commas.", "--outputs", rich_help_panel=TWIN)
-]
+Inputs = Annotated[str, option("NAMES", "Of a function's inputs, joined by commas.", "--inputs")]
+Outputs = Annotated[str, option("NAMES", "Of its outputs, joined by commas.", "--outputs")]
 MaxBytes = Annotated[int | None, rare("N", "Limit of a file; else what is free.", min=1)]
 MAX_SEED = 2**63 - 1
 """The largest seed that every generator of random numbers takes."""

@@ -326,10 +326,14 @@ def interrupted_by_term() -> Iterator[None]:
 
 @contextmanager
 def show_warnings() -> Iterator[None]:
-    """Print each warning as one line on stderr, without its source line."""
+    """Print each warning as one line on stderr, once and without its source line."""
+    shown: set[str] = set()
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
-        _mark("warning", "yellow", str(message))
+        # Python's own record of what was shown is lost with every `catch_warnings`.
+        if str(message) not in shown:
+            shown.add(str(message))
+            _mark("warning", "yellow", str(message))
 
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)
