@@ -629,7 +629,10 @@ def test_a_unit_in_the_name_of_a_signal_is_converted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "unit"),
-    [("speed_m_s", "m/s"), ("valve_pct", "%"), ("mm", ""), ("torque_Nm", "N m"), ("x_cmd", "")],
+    [
+        *[("speed_m_s", "m/s"), ("a_m_s2", "m/s^2"), ("valve_pct", "%"), ("torque_Nm", "N m")],
+        *[("mm", ""), ("x_cmd", ""), ("phase_A", ""), ("alarms", "")],
+    ],
 )
 def test_units_at_the_end_of_names(name: str, unit: str) -> None:
     assert unit_in_name(name) == unit

@@ -86,7 +86,11 @@ def fit(
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     if model is None:
         leave_out({"--random-onset": random_onset}, "without --from")
-        made = _train(file, classifier or "cnn", case_named(case), rate, seed, reading)
+        remedy = "name it, or invert a corrected twin: --from MODEL"
+        labelled = given("FILE", file, "labelled trajectories", remedy=remedy)
+        chosen = catalog.make(catalog.CLASSIFIERS, classifier or "cnn", "classifier")
+        system = case_named(case)
+        made = _train(reading(labelled, system), chosen, system, rate, seed)
     else:
         leave_out({"--classifier": classifier, "--rate": rate}, "with --from")
         made = _invert(model, file, case, random_onset, reading)
@@ -95,40 +99,28 @@ def fit(
 
 
 def _train(
-    file: Path | None,
-    classifier: str,
-    system: Case | None,
-    rate: float | None,
-    seed: int,
-    reading: Callable[..., Trajectories],
+    training: Trajectories, classifier: Any, system: Case | None, rate: float | None, seed: int
 ) -> FittedDiagnoser:
     """A classifier of labelled trajectories."""
     import retwin as rt
 
-    chosen = catalog.make(catalog.CLASSIFIERS, classifier, "classifier")
-    remedy = "name it, or invert a corrected twin: --from MODEL"
-    training = reading(given("FILE", file, "labelled trajectories", remedy=remedy), system)
     with bar("train") as show:
         diagnoser = rt.fit_diagnoser(
             training,
-            chosen,
+            classifier,
             seed=seed,
             classes=None if system is None else system.classes,
             rate=rate,
-            progress=lambda share: show(classifier, share),
+            progress=lambda share: show("classifier", share),
         )
     assert diagnoser.fitted is not None
     accuracy = diagnoser.fitted.figures["accuracy"]
-    answer(None, f"Accuracy on the held-out fifth of {Path(file or '').name}: {accuracy:.3f}")
+    answer(None, f"Accuracy on the held-out fifth of these trajectories: {accuracy:.3f}")
     return diagnoser
 
 
 def _invert(
-    model: Path,
-    real: Path | None,
-    case: str | None,
-    random_onset: bool,
-    reading: Callable[..., Trajectories],
+    model: Path, real: Path | None, case: str | None, onset: bool, reading: Callable
 ) -> FittedDiagnoser:
     """The inversion of a corrected twin; only healthy trajectories are used."""
     import retwin as rt
@@ -136,7 +128,7 @@ def _invert(
 
     updated = updated_twin(model)
     system = system_of(updated, model, case)
-    if random_onset:
+    if onset:
         system = system.with_random_onset()
     if isinstance(updated, DynamicsTwin):
         leave_out({"FILE": real}, "for corrected dynamics, which need none")

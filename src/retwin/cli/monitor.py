@@ -251,7 +251,7 @@ def run(
         int | None, option("N", "Of the demo's page; else 8710; 0: any.", min=0, max=65535)
     ] = None,
     open_page: Annotated[bool, option("", "Open the demo's page in a browser.", "--open")] = False,
-    seconds: Annotated[float | None, option("S", "End by itself after this time.")] = None,
+    seconds: Annotated[float | None, option("S", "End the demo after this time.")] = None,
 ) -> None:
     """Watch running machines, until Ctrl-C or SIGTERM.
 
@@ -264,20 +264,17 @@ def run(
         leave_out({"--config": None if config == CONFIG else config}, "with --demo")
         _demonstrate(8710 if port is None else port, open_page, seconds)
         return
-    leave_out({"--port": port, "--open": open_page}, "without --demo")
+    others = {"--port": port, "--open": open_page, "--seconds": seconds}
+    leave_out(others, "without --demo")
     from retwin.monitor.program import run as watch
     from retwin.monitor.settings import read_settings
 
     settings, stop = read_settings(config), threading.Event()
-    end = threading.Timer(seconds or 0.0, stop.set)
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
     try:
-        if seconds is not None:
-            end.start()
         watch(settings, lambda line: answer(None, line), stop)
     finally:
-        end.cancel()
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
     note("Stopped; everything that was acknowledged is stored.")

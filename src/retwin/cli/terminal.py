@@ -25,6 +25,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgres
 from rich.table import Table
 from rich.text import Text
 
+from retwin.checks import install_command
 from retwin.errors import place_of
 from retwin.progress import FinishedStage, ResumedStage
 
@@ -279,7 +280,9 @@ def complain_of_interruption(kept: str = "") -> None:
 
 def described(error: Exception) -> str:
     """Type and message of an exception, and the line of the user's code that raised it."""
-    at = "; ".join(getattr(error, "__notes__", ())) or place_of(error)
+    at = "; ".join(dict.fromkeys(getattr(error, "__notes__", ()))) or place_of(error)
+    if isinstance(error, ModuleNotFoundError) and not at:
+        at = f"install what retwin needs: {install_command()}"
     if not (at or isinstance(error, OSError | RuntimeError)):
         at = "RETWIN_TRACEBACK=1 in the environment shows where"
     return f"{type(error).__name__}: {error}" + (f" ({at})" if at else "")

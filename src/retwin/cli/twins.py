@@ -21,8 +21,10 @@ from retwin.cli.films import (
     film_settings,
 )
 from retwin.cli.options import (
+    Inputs,
     Json,
     MaxBytes,
+    Outputs,
     Seed,
     argument,
     channel_names,
@@ -57,8 +59,6 @@ TwinName = Annotated[
         "TWIN", "See `retwin twin info`; or a saved model's folder.", autocompletion=complete_twins
     ),
 ]
-Inputs = Annotated[str, rare("NAMES", "Of the inputs, joined by commas.")]
-Outputs = Annotated[str, rare("NAMES", "Of the outputs, joined by commas.")]
 Rate = Annotated[float | None, rare("HZ", "Samples per second.", min=1e-9)]
 
 RAMPS = 5

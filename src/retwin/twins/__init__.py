@@ -180,24 +180,19 @@ def _of_function(
 def _check_one_array(name: str, function: Callable[..., Any], inputs: Sequence[str]) -> None:
     """Refuse a function that takes an array of each command: its order is not that of `inputs`."""
     try:
-        taken = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # some compiled functions have no signature
+        signature = inspect.signature(function)
+        signature.bind(0, **{each: 0 for each in ("rng", "rate") if each in signature.parameters})
+    except TypeError as error:
+        passed = ", ".join(f"{each}=u[..., {i}]" for i, each in enumerate(inputs))
+        raise InputError(
+            f"twin {name!r}",
+            expected="a function of one array of commands u, (n, T, d_u), and of numbers with "
+            "defaults",
+            got=f"{name.rpartition(':')[2]}{signature}, {error}",
+            remedy=f"name a function of u that calls it by names, with {passed}",
+        ) from None
+    except ValueError:  # some compiled functions have no signature
         return
-    needed = [
-        each.name
-        for each in taken
-        if each.default is each.empty
-        and each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)
-        and each.name not in ("rng", "rate")
-    ]
-    passed = ", ".join(f"{each}=u[..., {i}]" for i, each in enumerate(inputs))
-    require(
-        len(needed) < 2,
-        f"twin {name!r}",
-        expected="a function of one array of commands, (n, T, d_u), and of numbers with defaults",
-        got=f"one of {', '.join(needed)}",
-        remedy=f"name a function of u that calls it by names: {name.rpartition(':')[2]}({passed})",
-    )
 
 
 def _needs_no_arguments(function: Callable[..., Any]) -> bool:

@@ -36,38 +36,24 @@ SPELT = {
 }
 """Spellings in logs, and those of pint. C is a temperature there, no charge."""
 
-IN_NAMES = {
-    **{
-        unit: unit
-        for unit in (
-            *("um", "mm", "cm", "m", "km", "rad", "mrad", "deg", "degC", "degF", "K", "rpm", "Hz"),
-            *("us", "ms", "s", "min", "N", "kN", "Pa", "hPa", "kPa", "MPa", "mbar", "bar"),
-            *("V", "mV", "A", "mA", "W", "kW", "kWh", "J", "g", "kg", "percent"),
-        )
-    },
-    "pct": "%",
-    "mps": "m/s",
-    "m_s": "m/s",
-    "m_s2": "m/s^2",
-    "mm_s": "mm/s",
-    "kmh": "km/h",
-    "km_h": "km/h",
-    "rad_s": "rad/s",
-    "deg_s": "deg/s",
-    "Nm": "N m",
-    "N_m": "N m",
-    "l_min": "liter/min",
-    "kg_s": "kg/s",
-    "kg_h": "kg/h",
-}
-"""Units by how names of signals end, after an underscore, as `position_mm` and `speed_m_s`."""
+ENDING = re.compile(
+    r"_((?:um|mm|cm|km|m?rad|deg[CF]?|rpm|k?Hz|[um]s|Nm|kN|[hkM]?Pa|m?bar|m[VA]|kWh?|kg|percent|pct)"
+    r"(?:_(?:s|s2|h|min))?|[mlg]_(?:s|s2|h|min)|mps|kmh)$"
+)
+"""How names of signals end that state a unit, as `position_mm` and `speed_m_s`.
+
+A single letter is none: `phase_A` and `torque_m` are no currents and lengths.
+"""
+SHORT = {"mps": "m/s", "kmh": "km/h", "Nm": "N m", "pct": "%"}
 
 
 def unit_in_name(name: str) -> str:
     """The unit with which the name of a signal ends, after an underscore; "" if with none."""
-    parts = name.split("_")
-    endings = ["_".join(parts[-count:]) for count in (2, 1) if len(parts) > count]
-    return next((IN_NAMES[each] for each in endings if each in IN_NAMES), "")
+    found = ENDING.search(name)
+    if found is None:
+        return ""
+    unit, _, per = found[1].partition("_")
+    return SHORT.get(unit, unit) + (f"/{per.replace('s2', 's^2')}" if per else "")
 
 
 def same_unit(first: str, second: str) -> bool:
