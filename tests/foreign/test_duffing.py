@@ -66,6 +66,6 @@ def test_unmeasured_rows_and_a_sentinel(folder: Path) -> None:
     ended = retwin(folder, f"fit duffing.toml --real sentinel.csv {words} wrong", code=2)
     *notes, line = ended.lines
     assert all("3.4e+38" in each for each in notes), notes
-    assert line.startswith("error: calibration.observed: ")
-    assert "3.4e+38 of x" in line
+    assert line.startswith("error: calibration-1: expected numbers below ")
+    assert "3.4e+38 for x" in line
     assert not (folder / "wrong").exists()

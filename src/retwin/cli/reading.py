@@ -150,11 +150,16 @@ def _read(
     if isinstance(case, str):  # a built-in case without torch has no twin to read logs by
         case = case_named(case) if log and not file.is_dir() else data_case(case)
     divided = log and getattr(case, "records", None) is not None
-    twin = getattr(case, "twin", None)
+    twin: Any = getattr(case, "twin", None)
     if divided or (log and is_log(file) and twin is not None):
         from retwin.cases import LogReader
 
-        reader, own = LogReader(max_bytes=max_bytes), case if divided else None
+        reader = LogReader(max_bytes=max_bytes)
+        if divided and is_log(file):  # one with the names of the channels is read by these
+            divided = not set(twin.inputs.names) <= set(reader.signals(file)) or not (
+                reader.measured_outputs([file], twin)
+            )
+        own = case if divided else None
         found = reader.trajectories([file], twin, case=own)
         for text in found.notes:
             note(text)
@@ -204,11 +209,13 @@ def read_commands(file: Path, case: Case, *, mapping: Path | None = None) -> Tra
     from retwin.twins import FunctionTwin
 
     twin, table = case.twin, mapping is None and file.is_file() and is_log(file)
-    if not table or case.records is not None or LogReader().measured_outputs([file], twin):
+    if not table or LogReader().measured_outputs([file], twin):
         return read(file, case, mapping=mapping)
     # A twin whose outputs are its commands, so that no output is missing.
     alone = FunctionTwin(lambda u: u, rate=twin.rate, inputs=twin.inputs, outputs=twin.inputs)
     found = read(file, replace(case, twin=alone))
+    if found.outputs == twin.outputs:  # the records that the case states of the table
+        return found
     nothing = np.zeros((*found.commands.shape[:2], len(twin.outputs)))
     unseen = np.zeros(nothing.shape, dtype=bool)
     outputs = {"outputs": twin.outputs, "nominal": nothing, "observed": nothing, "mask": unseen}
