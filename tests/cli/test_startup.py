@@ -94,3 +94,14 @@ def test_a_command_without_torch_starts_at_once(
     found, seconds, heavy = measured(COMMAND, words, folder)
     assert (found, heavy) == (code, [])
     assert seconds < FACTOR * bare
+
+
+@pytest.mark.parametrize("package", ["torch", "mujoco"])
+def test_a_missing_package_is_named_with_what_installs_it(package: str, folder: Path) -> None:
+    code = f"import sys; sys.modules[{package!r}] = None{COMMAND}"
+    words = ["fit", "armpi", "--real", "arm.npz", "--out", "made"]
+    command = [sys.executable, "-c", f"{code}", *words]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert package in done.stderr
+    assert "install what retwin needs: pip install" in done.stderr
