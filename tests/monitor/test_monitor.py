@@ -12,7 +12,7 @@ from retwin.errors import InputError
 from retwin.monitor.detect.detector import Detector
 from retwin.monitor.detect.predictors import SLOWER, agreeing
 from retwin.monitor.detect.slack import Slack
-from retwin.monitor.models.cause import find_causes, possible_causes
+from retwin.monitor.models.cause import find_cause, find_causes, possible_causes
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.monitor_state import MonitorState
@@ -310,6 +310,17 @@ def test_a_fault_that_lasts_or_ends_is_the_only_cause_of_its_event(
     names, count = named_causes(monitor, record(1, 5, faults=[leak]))
     assert names == ["drain changed"]
     assert count > 1, "further alarms belong to the event"
+
+
+def test_an_alarm_just_after_the_first_one_names_no_second_fault(monitor: Monitor) -> None:
+    """Its window has the onset of the first fault, which it may explain by another class."""
+    leaking = record(1, 5, faults=[ParameterShift("drain", size=1.3, onset=30.0)])
+    alarms = monitor.watch(leaking).alarms[:2]
+    assert alarms[1].sample - alarms[0].sample <= 10
+    causes, other = possible_causes(monitor.twin), "pump: another effect"
+    cause = find_cause(monitor.twin, leaking, alarms, causes, current=other)
+    assert cause.name == "drain changed"
+    assert cause.same
 
 
 def test_a_second_fault_in_an_event_is_named(monitor: Monitor) -> None:

@@ -29,8 +29,8 @@ from retwin.twins.faults.system_faults import (
 from retwin.update.dynamics.online import moved
 from retwin.update.dynamics.twin import DynamicsTwin
 
-UNEXPLAINED = 0.5
-"""Probability from which on a cause does not explain all, or is the one that is named."""
+PROBABLE = 0.5
+"""Probability from which on it is said that there is more than a cause, or which one is second."""
 BEFORE = 100
 """Samples before an alarm from which its cause is inferred."""
 MIN_WINDOW = 10
@@ -85,7 +85,7 @@ def cause_title(name: str) -> str:
 
 def cause_text(name: str, since: str, unknown: float) -> str:
     """A cause with its onset, "" where that is not known, and whether there is more to it."""
-    more = ", and more than that" if since and unknown > UNEXPLAINED else ""
+    more = ", and more than that" if since and unknown > PROBABLE else ""
     return f"{cause_title(name)}{f' from {since}' if since else ''}{more}"
 
 
@@ -198,7 +198,7 @@ def find_causes(
 
     """
     whole("before", before, least=MIN_WINDOW)
-    ids, found, earlier = record.ids.tolist(), [], dict[str, list[Alarm]]()
+    ids, found, known = record.ids.tolist(), [], dict[str, list[Alarm]]()
     current = dict[tuple[str, int], str]()
     for alarm in alarms:
         require(
@@ -208,18 +208,18 @@ def find_causes(
             got=f"one of {alarm.trajectory!r} at sample {alarm.sample}",
             remedy="give the record that was watched",
         )
-        one = record[[ids.index(alarm.trajectory)]]
-        event, before_it = (alarm.trajectory, alarm.event), earlier.get(alarm.trajectory, [])
+        event = alarm.trajectory, alarm.event
+        until = known.setdefault(alarm.trajectory, [])
+        until.append(alarm)
         cause = find_cause(
             twin,
-            one,
-            [*before_it, alarm],
+            record[[ids.index(alarm.trajectory)]],
+            until,
             faults,
             before,
             current=current.get(event, ""),
             known_start=known_start,
         )
-        earlier[alarm.trajectory] = [*before_it, alarm]
         if not cause.same:
             current[event] = cause.name
         found.append(cause)
@@ -238,9 +238,9 @@ def find_cause(
 ) -> Cause:
     """The cause of the last of a trajectory's alarms, see `find_causes`.
 
-    A further alarm of an event is the `same` fault, and no second one, unless another class is
-    probable for what came after the alarm before it, began after that, and both faults together
-    have more evidence than the first one alone, which lasts or has ended.
+    A further alarm of an event is of the `same` fault, and of no second one, unless another class
+    is probable for what came after an earlier alarm of the event, and both faults together have
+    more evidence than the first one alone, which lasts or has ended.
 
     Parameters
     ----------
@@ -254,8 +254,8 @@ def find_cause(
     first = max(0, alarm.sample - before, last + 1)
     begin, window = first / record.rate, _window(record, first, alarm.sample)
     latest = (alarm.sample - first) / record.rate
-    open_ = {name: _lasting(fault, latest) for name, fault in faults.items()}
-    made = StateInversionDiagnoser(moved(twin, alarm.machine), open_).diagnose(
+    lasting = {name: _lasting(fault, latest) for name, fault in faults.items()}
+    made = StateInversionDiagnoser(moved(twin, alarm.machine), lasting).diagnose(
         window, known_start=known_start and first == 0
     )
     best = int(made.probabilities[0].argmax())
@@ -276,13 +276,13 @@ def find_cause(
     )
     if alarm.event not in [each.event for each in alarms[:-1]]:
         return cause
-    likely = cause.probability * (1 - cause.unknown) > UNEXPLAINED
-    begun = cause.onset[1] > last / record.rate  # the healthy class has no onset
-    same = cause.name == current or not (begun and likely)
+    likely = cause.probability * (1 - cause.unknown) > PROBABLE
+    same = cause.name in (current, HEALTHY) or not likely
     known, own = faults.get(current), [each for each in earlier if each.event == alarm.event]
-    if not same and own and isinstance(known, TimedFault):
+    if not same and isinstance(known, TimedFault):
         both = known, faults[cause.name]
-        same = not _second(twin, record, [*own, alarm], both, np.log(len(faults)))
+        # Without an earlier alarm that leaves a window, the first fault's onset is in this one.
+        same = not own or not _second(twin, record, [*own, alarm], both, np.log(len(faults)))
     return replace(cause, same=same)
 
 
