@@ -80,7 +80,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links stay within the site, examples are executed, and long tables are folded."""
     for path, name in OUTSIDE.items():
-        markdown = markdown.replace(f"](../{path})", f"]({name})")
+        markdown = re.sub(rf"\]\(\.\./{re.escape(path)}(?=[)#])", f"]({name}", markdown)
     if page.file.src_uri in OUTSIDE.values():
         markdown = re.sub(r"\]\((?:\.\./)*docs/", "](", markdown)
         markdown = re.sub(rf"\]\(({'|'.join(MEASURED)})\.md", r"](results_\1.md", markdown)
