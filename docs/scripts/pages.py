@@ -27,6 +27,7 @@ ROOT = Path(__file__).parents[2]
 OUTSIDE = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "examples/heater": "heater.md",
     "examples/two_tanks": "two_tanks.md",
     "tests/testing/crane.xml": "crane.xml",
 }

@@ -352,7 +352,7 @@ def test_the_how_to_is_true(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tests = Path(__file__).parents[1]
-    page = section("twins", "A twin that is a MuJoCo model")
+    page = section("twins", "MuJoCo")
     (tmp_path / "crane.xml").write_text((tests / "testing" / "crane.xml").read_text("utf-8"))
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
