@@ -3,10 +3,10 @@
 Target: at most 2 GB for parent and workers together, whatever the number of trajectories. The twin
 is the closed-form arm, 1000 samples, all nine classes. The uses of the data are timed too: features
 for a classifier, and the samples from which a surrogate learns (it trains for one epoch, which
-takes the same time for any number of trajectories). For docs/scaling.md, several twins are timed on
-one core in processor time, which excludes other work of the machine. The arguments are the number
-of trajectories, where 0 skips the first part, and folders that `CorrectedTwin.save` wrote for the
-arm, in whose place the closed-form arm is not written; then the second part is skipped.
+takes the same time for any number of trajectories). For results/scaling.md, several twins are timed
+on one core in processor time, which excludes other work of the machine. The arguments are the
+number of trajectories, where 0 skips the first part, and folders that `CorrectedTwin.save` wrote
+for the arm, in whose place the closed-form arm is not written; then the second part is skipped.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Everything of docs/speed.md that one command can measure, in processor time and by the clock.
+"""Everything of results/speed.md that one command can measure, in processor time and by the clock.
 
 The argument is a folder that `CorrectedTwin.save` wrote for the arm, in command space; a second one
 may be of a twin with `DelayOffset`. Processor time is that of all threads, and counts on a busy

@@ -134,6 +134,6 @@ def publish(
 
 if __name__ == "__main__":
     with warnings.catch_warnings():
-        # They name parameters that are not identified, see docs/updating.md.
+        # They name parameters that are not identified, see docs/correct.md.
         warnings.simplefilter("ignore", UserWarning)
         main(int(sys.argv[1]) if len(sys.argv) > 1 else 1)

@@ -17,18 +17,16 @@ import nbformat
 import numpy as np
 import pytest
 from nbclient import NotebookClient
-from test_readme import ROOT, blocks, shown
+from test_readme import ROOT, blocks, python_of, shown
 from typer.testing import CliRunner
 
 import retwin as rt
 from retwin.cli import app
 
 DOCS, TESTS = ROOT / "docs", ROOT / "tests"
-HERE = ("extending.md", "logs.md", "own_data.md", "own_simulator.md", "tanks.md")
+HERE = ("architecture.md", "data.md", "tanks.md")
 """Pages whose blocks run below, one after the other."""
-LONG = ("own_simulator.md",)
-"""Of these, pages that take longer than the fast tests may."""
-APART = ("fmu.md", "identify.md", "pitfalls.md", "scale.md", "tutorial.md")
+APART = ("identify.md", "pitfalls.md", "scale.md", "tutorial.md", "twins.md")
 """Pages with a test of their own below."""
 SMALL = "--sources dt --per-class 9"
 """What makes the tutorial's study small enough for a test."""
@@ -76,25 +74,23 @@ def run(page: str, into: dict[str, Any], *codes: str) -> dict[str, Any]:
 def test_no_python_block_is_left_out() -> None:
     """A page that does not run here is run by the test of its subject."""
     texts = [file.read_text("utf-8") for file in TESTS.rglob("*.py") if file != Path(__file__)]
-    running = "".join(text for text in texts if '"docs" /' in text)
+    running = "".join(texts)
     for page in DOCS.glob("*.md"):
         if blocks(page, "python") and page.name not in (*HERE, *APART):
-            assert f'"{page.name}"' in running, f"no test runs the Python of {page.name}"
+            assert re.search(rf'"{page.name}"|python_of\("{page.stem}"', running), (
+                f"no test runs the Python of {page.name}"
+            )
 
 
-@pytest.mark.parametrize(
-    "page", [pytest.param(each, marks=[pytest.mark.slow] * (each in LONG)) for each in HERE]
-)
+@pytest.mark.parametrize("page", HERE)
 def test_the_code_of_a_page_runs(page: str, module: ModuleType) -> None:
     names = run(page, vars(module))
-    if page == "extending.md":
+    if page == "architecture.md":
         tried = rt.generate(names["case"].twin, names["case"], per_class=20, seed=2)
         assert rt.evaluate(names["nearest"], tried).macro_f1 > 0.8
-    if page == "logs.md":
+    if page == "data.md":
         assert [len(names["bench"]), names["bench"].steps] == [2, 1250]
         assert 0.015 < names["bench"].provenance[0].sampling[1].missing < 0.03
-    if page == "own_simulator.md":
-        assert 0.8 < names["fidelity"].figures["coverage90"].value < 1.0
 
 
 def test_the_functions_that_pages_place_in_files_are_there() -> None:
@@ -119,9 +115,9 @@ def test_the_page_on_fmus(folder: Path) -> None:
     build = [sys.executable, "-m", "pythonfmu", "build", "-f", "drive.py", "-d", "."]
     subprocess.run(build, check=True, capture_output=True)
     (folder / "Drive.fmu").rename("drive.fmu")
-    (code,) = blocks(DOCS / "fmu.md", "python")
+    (code,) = python_of("twins", "FMU")
     torque = np.ones((2, 50, 1))
-    made = run("fmu.md", {"__name__": "__main__", "commands": torque}, code)["made"]
+    made = run("twins.md", {"__name__": "__main__", "commands": torque}, code)["made"]
     assert made.observed[0, -1, 0] == pytest.approx(49 * 0.01 / 0.02, rel=1e-3)
 
 

@@ -32,6 +32,26 @@ def blocks(page: Path, *languages: str) -> list[str]:
     return [text for language, text in found if language in languages]
 
 
+def section(page: str, title: str) -> str:
+    """The part of a page of docs/ under the heading, or in the tab, of this title."""
+    text = (ROOT / "docs" / f"{page}.md").read_text("utf-8")
+    tab = re.search(rf"^/// tab \| {re.escape(title)}\n(.*?)^///$", text, re.M | re.S)
+    if tab:
+        return tab[1]
+    prose = re.sub(
+        r"^```.*?^```", lambda code: re.sub(r"[^\n]", " ", code[0]), text, flags=re.M | re.S
+    )
+    begin = re.search(rf"^(#+) {re.escape(title)}$", prose, re.M)
+    assert begin, f"docs/{page}.md has no heading {title!r}"
+    end = re.search(rf"^#{{1,{len(begin[1])}}} ", prose[begin.end() :], re.M)
+    return text[begin.end() :][: end.start() if end else None]
+
+
+def python_of(page: str, title: str) -> list[str]:
+    """The Python blocks of a part of a page."""
+    return re.findall(r"^```python\n(.*?)^```", section(page, title), re.M | re.S)
+
+
 def shown(page: Path) -> list[tuple[str, bool]]:
     """Every `retwin …` command of a page, and whether it is whole (a line of a shell block)."""
     lines = [

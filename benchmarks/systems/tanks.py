@@ -14,7 +14,7 @@ from systems.system import System
 
 PUBLISHED = (
     "0.34 nonlinear state space, 0.45 polynomial nonlinear state space (quoted in Mathematical "
-    "Problems in Engineering, 2021; see docs/tanks.md)"
+    "Problems in Engineering, 2021; see results/tanks.md)"
 )
 
 

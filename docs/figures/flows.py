@@ -61,48 +61,6 @@ FLOWS: dict[str, tuple[str, Columns] | tuple[str, Columns, tuple[tuple[int, int,
             (("one Zarr folder", GREEN),),
         ),
     ),
-    "flow-own-twin": (
-        "One file describes a system; every command and function takes it",
-        (
-            (("twin.py\nthe simulator", MUTED), ("data.csv\nmeasured", MUTED)),
-            (("case.toml\nchannels, units,\nparameters", BLUE),),
-            (("retwin fit", GREEN), ("retwin study", GREEN), ("retwin monitor", GREEN)),
-        ),
-    ),
-    "flow-function": (
-        "Two ways to a twin from Python: a function, or equations that are compiled",
-        (
-            (("function of\ncommands", MUTED), ("ẋ = f(x, u, p)", MUTED)),
-            (("FunctionTwin", BLUE), ("StateTwin\ncompiled", BLUE)),
-            (("simulate", GREEN), ("identify", GREEN), ("fit_dynamics,\nC code, FMU", GREEN)),
-        ),
-        ((0, 0, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1), (1, 1, 2)),
-    ),
-    "flow-fmu": (
-        "The FMU runs in processes of its own: a crash ends one trajectory",
-        (
-            (("Simulink,\nDymola, …", MUTED),),
-            (("plant.fmu", MUTED),),
-            (("worker 1", BLUE), ("worker 2", BLUE), ("worker 3 …", BLUE)),
-            (("FMUTwin\nis a Twin", GREEN),),
-        ),
-    ),
-    "flow-data": (
-        "All files become one type, which checks itself and knows where it comes from",
-        (
-            (("MAT, NPZ, Zarr", MUTED), ("CSV folders", MUTED), ("logs, with\na mapping", MUTED)),
-            (("Trajectories\nn runs, one grid", BLUE),),
-            (("commands\n(n, T, inputs)", GREEN), ("nominal, observed\n(n, T, outputs)", GREEN)),
-        ),
-    ),
-    "flow-next": (
-        "Which experiment next: the one that narrows the predictions most",
-        (
-            (("CorrectedTwin", MUTED), ("healthy\ntrajectories", MUTED), ("sampler", MUTED)),
-            (("next_experiments", BLUE),),
-            (("commands to\nsend", GREEN), ("enough, or\nhow many more", GREEN)),
-        ),
-    ),
     "flow-identify": (
         "Part of the measurements is held out, so that the result can be judged",
         (

@@ -27,21 +27,23 @@ ROOT = Path(__file__).parents[2]
 OUTSIDE = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "examples/heater": "heater.md",
     "examples/two_tanks": "two_tanks.md",
     "tests/testing/crane.xml": "crane.xml",
-    "benchmarks/results/arm.md": "results_arm.md",
-    "benchmarks/results/systems.md": "results_systems.md",
-    "benchmarks/results/monitor.md": "results_monitor.md",
-    "benchmarks/results/speed.md": "results_speed.md",
-    "benchmarks/results/intervals.md": "results_intervals.md",
 }
 """Files and folders outside of docs/ that the site has too, and their names there."""
+OUTSIDE |= {
+    f"benchmarks/results/{file.name}": f"results_{file.name}"
+    for file in sorted((ROOT / "benchmarks" / "results").glob("*.md"))
+}
 EXECUTED = ("tutorial.md",)
 """Pages whose Python runs when the site is built; the examples of the API do, too."""
 CONTINUED = {"api/report.md": "api/study.md"}
 """Pages whose Python goes on where that of another page, which stands before it, has ended."""
 FOLDED = tuple(f"results_{part}.md" for part in ("arm", "systems", "monitor", "speed"))
 """Pages whose tables are folded."""
+MEASURED = tuple(Path(name).stem for name in OUTSIDE if name.startswith("benchmarks/"))
+"""The files of results."""
 TABLE = re.compile(r"^\|.*\n(?:\|.*\n?){3,}", re.MULTILINE)
 DETAILS = '<details markdown="1"><summary>Table</summary>\n\n{table}\n\n</details>\n'
 ABOUT_COMMANDS = """
@@ -79,10 +81,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links stay within the site, examples are executed, and long tables are folded."""
     for path, name in OUTSIDE.items():
-        markdown = markdown.replace(f"](../{path})", f"]({name})")
+        markdown = re.sub(rf"\]\(\.\./{re.escape(path)}(?=[)#])", f"]({name}", markdown)
     if page.file.src_uri in OUTSIDE.values():
         markdown = re.sub(r"\]\((?:\.\./)*docs/", "](", markdown)
-        markdown = re.sub(r"\]\((arm|systems|monitor|speed)\.md#", r"](results_\1.md#", markdown)
+        markdown = re.sub(rf"\]\(({'|'.join(MEASURED)})\.md", r"](results_\1.md", markdown)
     name = page.file.src_uri
     if name in EXECUTED or name.startswith("api/"):
         markdown = executed(markdown, re.sub(r"\W", "_", CONTINUED.get(name, name)))

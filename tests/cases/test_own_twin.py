@@ -25,7 +25,8 @@ def shown(language: str) -> list[str]:
 
 
 def test_the_page_shows_the_files_of_the_example() -> None:
-    module, _ = shown("python")
+    heater, module, _ = shown("python")
+    assert heater == (EXAMPLE.parent / "heater" / "heater.py").read_text("utf-8")
     (case,) = shown("toml")
     assert module == (EXAMPLE / "two_tanks.py").read_text("utf-8")
     assert case == (EXAMPLE / "case.toml").read_text("utf-8")
@@ -60,7 +61,7 @@ def test_the_code_of_the_page_runs(
         write_record(tmp_path / "dataBenchmark.csv", rt.cases.get("case.toml"))
     names: dict[str, Any] = {}
     try:
-        exec(compile(shown("python")[1], "own_twin.md", "exec"), names)
+        exec(compile(shown("python")[2], "own_twin.md", "exec"), names)
     finally:
         sys.modules.pop("two_tanks", None)
     print(printed := capsys.readouterr().out)

@@ -677,7 +677,7 @@ def test_provenance_of_other_files_stays_as_it_was() -> None:
 
 def test_the_mapping_of_the_documentation_is_read_and_follows_the_schema(tmp_path: Path) -> None:
     docs = Path(__file__).parents[2] / "docs"
-    text = (docs / "logs.md").read_text("utf-8").split("```toml\n")[1].split("```")[0]
+    text = (docs / "data.md").read_text("utf-8").split("```toml\n")[1].split("```")[0]
     (tmp_path / "mapping.toml").write_text(text)
     found = read_mapping(tmp_path / "mapping.toml")
     assert found.cut.signal in found.signals

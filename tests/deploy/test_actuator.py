@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
-import re
 import sys
 import types
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from test_readme import python_of
 
 import retwin as rt
 from retwin.deploy import export_actuator
@@ -447,9 +447,8 @@ def test_the_wrappers_keep_the_documented_signatures(
 @pytest.mark.slow
 def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    page = EXAMPLES.parents[1] / "docs" / "actuator.md"
-    code = "".join(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
+    code = "".join(python_of("export", "Actuators for robot learning"))
     names: dict = {}
-    exec(compile(code, str(page), "exec"), names)
+    exec(compile(code, "docs/export.md", "exec"), names)
     assert names["effective"].shape == (4096, 4)
     assert 0 < names["made"].delay[0] < 0.2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import warnings
 import zipfile
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.special import ndtri
+from test_readme import python_of
 
 import retwin as rt
 from retwin.compiler import compilers
@@ -22,7 +22,6 @@ from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
 
 fmpy = pytest.importorskip("fmpy")
 
-PAGE = Path(__file__).parents[2] / "docs" / "fmu_export.md"
 STEPS = 60
 HOSTILE = 'T "1" <°C> & \\n\n ü'
 
@@ -283,9 +282,9 @@ def test_the_command_line_exports_a_saved_twin(
 @pytest.mark.slow
 def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    code = "".join(re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL))
+    code = "".join(python_of("export", "The corrected twin in your tool"))
     names: dict = {}
-    exec(compile(code, str(PAGE), "exec"), names)
+    exec(compile(code, "docs/export.md", "exec"), names)
     found = names["found"]
     assert (found["outflow.q05"] < found["outflow.mean"]).all()
 

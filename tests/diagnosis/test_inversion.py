@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 import torch
 from scipy.stats import entropy, multivariate_normal
 from sklearn.metrics import roc_auc_score
+from test_readme import python_of
 from torch import Tensor
 
 import retwin as rt
@@ -524,10 +524,9 @@ def test_what_cannot_be_inverted_is_refused(
 
 @pytest.mark.slow
 def test_what_the_page_shows_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "inversion.md").read_text("utf-8")
-    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
+    (code,) = python_of("diagnose", "By inversion")
     names: dict[str, Any] = {}
-    exec(compile(code, "docs/inversion.md", "exec"), names)
+    exec(compile(code, "docs/diagnose.md", "exec"), names)
     assert "stands at" in capsys.readouterr().out
     assert (names["found"].probabilities[:, names["own"]] > 0.5).all()
 

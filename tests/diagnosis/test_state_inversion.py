@@ -5,12 +5,11 @@ The emulated box has a nonlinear loss, which its twin lacks.
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from test_readme import python_of
 
 import retwin as rt
 from retwin.diagnosis import StateDiagnosis, StateInversionDiagnoser
@@ -259,10 +258,9 @@ def test_a_twin_of_which_no_distribution_is_known_is_refused(records) -> None:
 
 
 def test_the_page_of_faults() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "faults.md").read_text("utf-8")
     names: dict = {"__name__": "shown"}
-    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(compile(code, "docs/faults.md", "exec"), names)
+    for code in python_of("diagnose", "Faults of any system"):
+        exec(compile(code, "docs/diagnose.md", "exec"), names)
     found, drawn = names["found"], names["records"].labels[5:]
     assert np.diag(found.probabilities).min() > 0.9
     assert (found.unknown < 0.5).all()

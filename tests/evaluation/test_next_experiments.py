@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from test_readme import python_of
 
 import retwin as rt
 from retwin.errors import InputError
@@ -193,8 +192,7 @@ def test_the_actuators_posterior_is_that_of_the_inference(
 
 @pytest.mark.slow
 def test_the_code_of_the_page_runs() -> None:
-    page = Path(__file__).parents[2] / "docs" / "next.md"
-    code = "".join(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
+    code = "".join(python_of("correct", "Which experiment next, and are these enough?"))
     found: dict = {}
-    exec(compile(code, str(page), "exec"), found)
+    exec(compile(code, "docs/correct.md", "exec"), found)
     assert found["made"].commands.shape[0] == 3

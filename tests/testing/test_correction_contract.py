@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from test_readme import python_of
 from torch import Tensor
 
 import retwin as rt
@@ -187,13 +186,12 @@ def test_all_that_is_broken_is_listed(context: rt.Context) -> None:
 
 
 def test_the_operator_of_the_docs_satisfies_it(context: rt.Context) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "corrections.md").read_text("utf-8")
-    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
+    (code,) = python_of("correct", "An operator of your own")
     # A dataclass needs its module in sys.modules.
     module = ModuleType("shown")
     sys.modules["shown"] = module
     try:
-        exec(compile(code, "docs/corrections.md", "exec"), vars(module))
+        exec(compile(code, "docs/correct.md", "exec"), vars(module))
         z = delays_and_offsets(context)[..., 1:]
         check_correction(module.SteadyOffset(), context, z)
     finally:

@@ -359,7 +359,7 @@ def test_a_function_that_the_workers_cannot_find_is_refused(
 
 @pytest.mark.slow
 def test_the_how_to_is_true(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "function.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "twins.md").read_text("utf-8")
     blocks = re.findall(r"^```python\n(# (\S+\.py)\n.*?)^```", page, re.M | re.S)
     files = {name: code for code, name in blocks}
     assert list(files) == ["tank.py", "noisy.py", "slow.py", "tanks.py", "test_tank.py"]

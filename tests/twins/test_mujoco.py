@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_readme import section
 
 import retwin as rt
 from retwin.twins.mujoco.twin import MuJoCoTwin, Servo
@@ -351,13 +352,13 @@ def test_the_how_to_is_true(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tests = Path(__file__).parents[1]
-    page = (tests.parent / "docs" / "mujoco.md").read_text("utf-8")
+    page = section("twins", "MuJoCo")
     (tmp_path / "crane.xml").write_text((tests / "testing" / "crane.xml").read_text("utf-8"))
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
     names: dict[str, object] = {}
     for code in blocks:
-        exec(compile(code, "mujoco.md", "exec"), names)
+        exec(compile(code, "docs/twins.md", "exec"), names)
     printed = re.findall(r"  # prints (.*)", page)
     assert printed
     assert capsys.readouterr().out.splitlines() == printed

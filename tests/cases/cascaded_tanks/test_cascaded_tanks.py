@@ -161,6 +161,7 @@ def test_the_twin_is_what_least_squares_gives_on_the_estimation_record() -> None
     rms = np.sqrt(np.square(estimation.residual).mean())
     assert found.figures["rms_after"] == pytest.approx(rms, abs=1e-3)
     assert rms == pytest.approx(0.603, abs=2e-3)
-    # The other twin's numbers are found likewise, with all free; see docs/tanks.md.
+    # The other twin's numbers are found likewise, with all free; see
+    # benchmarks/results/tanks.md.
     complete, _ = benchmark(tanks_overflow().twin)(file)
     assert np.sqrt(np.square(complete.residual).mean()) == pytest.approx(0.2033, abs=1e-3)

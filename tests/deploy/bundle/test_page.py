@@ -1,11 +1,11 @@
-"""What docs/bundle.md shows is true."""
+"""What docs/export.md shows is true."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from test_readme import ROOT, blocks
+from test_readme import python_of
 
 import retwin as rt
 from retwin.deploy.bundle.bundle import Bundle
@@ -25,8 +25,8 @@ def test_the_code_of_the_page_runs(
     rt.save(emulated, "real.npz")
     (tmp_path / "portable").symlink_to(exported[0])
     names: dict = {}
-    for code in blocks(ROOT / "docs" / "bundle.md", "python"):
-        exec(compile(code, "bundle.md", "exec"), names)
+    for code in python_of("export", "Bundles"):
+        exec(compile(code, "docs/export.md", "exec"), names)
     assert (names["found"].verdicts.verdict == "ok").mean() > 0.9
     assert len(names["made"]) == 18
     assert len(names["again"]) == 2

@@ -42,7 +42,7 @@ np.savez(sys.argv[3], found=found.probabilities, scores=found.verdicts.scores, m
 from importlib.metadata import packages_distributions
 names = packages_distributions()
 loaded = {names[each][0] for each in {name.partition(".")[0] for name in sys.modules} & set(names)}
-own = {"numpy", "onnxruntime", "pydantic", "scipy", "threadpoolctl"}  # as docs/bundle.md says
+own = {"numpy", "onnxruntime", "pydantic", "scipy", "threadpoolctl"}  # as docs/export.md says
 theirs = {"annotated-types", "pydantic_core", "typing-inspection", "typing_extensions"}
 others = {"charset-normalizer", "setuptools"}  # which load themselves, or scipy if they are there
 assert loaded <= own | theirs | others, loaded

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import kstest, multivariate_normal
+from test_readme import python_of
 from toys import FAST, LAG, LINE, commands, measured
 
 import retwin as rt
@@ -265,11 +265,10 @@ def test_every_trajectory_draws_parameters_of_its_own(chains: Posterior) -> None
 def test_the_code_of_the_page_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = (Path(__file__).parents[3] / "docs" / "updating.md").read_text("utf-8")
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    for code in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S):
-        exec(compile(code, "docs/updating.md", "exec"), names)
+    for code in python_of("correct", "Update a twin's own parameters"):
+        exec(compile(code, "docs/correct.md", "exec"), names)
     updated, posterior = names["updated"], names["posterior"]
     for name, true in {"gain": 1.7, "time": 0.8}.items():
         assert abs(updated.values[name] - true) < 4 * updated.errors[name] < 0.1

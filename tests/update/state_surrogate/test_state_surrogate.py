@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from fmus import c_fmu
 from numpy.typing import NDArray
+from test_readme import python_of
 
 import retwin as rt
 from retwin.cases.cascaded_tanks.case import VOLTAGES
@@ -313,10 +313,9 @@ def test_a_mujoco_model_with_memory(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_page_of_state_surrogates() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "state_surrogate.md").read_text("utf-8")
     names: dict = {"__name__": "shown"}
-    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(compile(code, "docs/state_surrogate.md", "exec"), names)
+    for code in python_of("dynamics", "State equations of a black box"):
+        exec(compile(code, "docs/dynamics.md", "exec"), names)
     assert names["learned"].figures["nrmse_level"] < 0.005
     found = names["fitted"]
     assert abs(found.parameters["leak"] - 0.06) < 3 * found.errors["leak"] < 0.003

@@ -43,9 +43,9 @@ REPEATING = np.array(
 
 @dataclass(frozen=True)
 class EmulatedArmPi(TwinWrapper):
-    """The arm as the real one behaves; the defaults are fitted to set A (docs/results.md).
+    """The arm as the real one behaves.
 
-    A command unit is 0.24 degrees.
+    The defaults are fitted to set A (benchmarks/results/arm.md). A command unit is 0.24 degrees.
 
     Parameters
     ----------

@@ -55,8 +55,8 @@ class ArmPiTwin:
     """The arm as a MuJoCo model: masses and inertias of its URDF, servos with a transport delay.
 
     The servos' stiffness, damping and delay in `armpi.xml` are fitted to the published twin
-    (docs/results.md). Commands are in servo units, the output is the end-effector position in m.
-    The nominal output is the forward kinematics of the clean commands without lag.
+    (benchmarks/results/arm.md). Commands are in servo units, the output is the end-effector
+    position in m. The nominal output is the forward kinematics of the clean commands without lag.
 
     Parameters
     ----------

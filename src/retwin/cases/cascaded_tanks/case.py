@@ -38,7 +38,10 @@ OVERFLOWING = OVERFLOWING_TANKS.parametric().with_values(
         "start_lower": 5.232571,
     }
 )
-"""The complete physics, with parameters identified on the estimation record (docs/tanks.md)."""
+"""The complete physics; its parameters are identified on the estimation record.
+
+See benchmarks/results/tanks.md.
+"""
 
 PERIOD = 1024 / RATE
 """Period of the benchmark's voltage in s."""

@@ -18,7 +18,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=500)]
 NO_NOMINAL = "no nominal outputs: they are 0; give the case, whose twin simulates them"
 """What the provenance says of a log that was read without a twin."""
-REMEDY = "see docs/logs.md for what it holds"
+REMEDY = "see docs/data.md for what it holds"
 
 
 class TimeSettings(Part):
@@ -112,7 +112,7 @@ class ChannelMapping(Part):
 
 
 class Mapping(Part):
-    """The keys of a mapping.toml; see docs/logs.md."""
+    """The keys of a mapping.toml; see docs/data.md."""
 
     rate: Positive | None = None
     """Sample rate of the trajectories in Hz; by default that of the case."""

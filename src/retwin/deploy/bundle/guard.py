@@ -51,12 +51,13 @@ MIN_MISMATCH = 0.05
 MIN_ODDS = 10.0
 """Smallest limit of the odds against a trajectory, as implausible trajectories are rare.
 
-MIN_MISMATCH and MIN_ODDS were chosen after scores of set A were known, see docs/bundle.md.
+MIN_MISMATCH and MIN_ODDS were chosen after scores of set A were known, see
+benchmarks/results/diagnosis.md.
 """
 LOG_BEND_SCALE = (-0.5, 0.7)
 """Range of the log of a bend's size, in standard deviations of the residual (0.6 to 2.0).
 
-It was chosen after scores of set A were known, see docs/bundle.md.
+It was chosen after scores of set A were known, see benchmarks/results/diagnosis.md.
 """
 MAX_KNOTS = 10
 """Greatest number of random levels of a bend."""

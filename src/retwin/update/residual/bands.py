@@ -86,7 +86,7 @@ def coverage_figures(
             remedy += ", or end it with a SampledSensor() if measurement noise is what it lacks"
         warnings.warn(
             f"correction: bands of 90 % hold {listed} of the calibration itself, since "
-            f"{_operators(model)} cannot express what was measured; {remedy} (docs/corrections.md)",
+            f"{_operators(model)} cannot express what was measured; {remedy} (docs/correct.md)",
             stacklevel=4,
         )
     return figures
