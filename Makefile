@@ -48,7 +48,6 @@ docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: install
-	$(BIN)/retwin bench
 	for name in generation training fitting command_space bands inversion updating residual \
 		importing twins fmu state_twin scale bundle parameter_coverage; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 	if [ -n "$$RETWIN_DATA" ]; then OMP_NUM_THREADS=1 $(BIN)/python benchmarks/systems.py; fi

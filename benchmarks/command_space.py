@@ -16,11 +16,10 @@ from functools import partial
 
 import numpy as np
 import torch
-from record import record
+from record import median_seconds, record
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC, UNIT
-from retwin.cli.bench import median_seconds
 
 COUNT = 100
 QUANTILE90 = 1.645

@@ -14,12 +14,11 @@ from functools import partial
 from pathlib import Path
 
 from fmu import ms_per_run
-from record import memory_bandwidth, peak_memory_gb, record
+from record import median_seconds, memory_bandwidth, peak_memory_gb, record
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC, ArmPiTwin
 from retwin.cases.case import Case
-from retwin.cli.bench import median_seconds
 from retwin.twins.fmu.twin import FMUTwin
 from retwin.twins.twin import Twin
 

@@ -9,7 +9,9 @@ import json
 import os
 import platform
 import resource
+import statistics
 import time
+import timeit
 from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -62,6 +64,11 @@ def timed(
     started = clock()
     result = make()
     return clock() - started, result
+
+
+def median_seconds(make: Callable[[], object], repeats: int = 3) -> float:
+    """Median time of `make` in s, by the wall clock."""
+    return statistics.median(timeit.repeat(make, repeat=repeats, number=1))
 
 
 def record(name: str, title: str, rows: dict[str, float] | dict[str, dict[str, float]]) -> None:

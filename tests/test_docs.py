@@ -239,5 +239,5 @@ def test_the_references_are_whole(site: Path) -> None:
     missing = [name for name in rt.__all__ if f"retwin.{name}" not in names and name[0] != "_"]
     assert not missing
     commands = (site / "cli.html").read_text("utf-8")
-    for name in ("demo", "fit", "generate", "study", "data fetch", "twin info", "diagnose fit"):
+    for name in ("demo", "fit", "generate", "study", "data convert", "twin info", "diagnose fit"):
         assert f"retwin {name}" in commands

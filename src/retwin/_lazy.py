@@ -31,7 +31,13 @@ def names(
 
     def attribute(name: str) -> Any:
         if name in homes:
-            return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
+            try:
+                return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
+            except ModuleNotFoundError as error:
+                from retwin.checks import install_command  # it needs numpy
+
+                error.add_note(f"install what retwin needs: {install_command()}")
+                raise
         if name.startswith("_") or find_spec(f"{package}.{name}") is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         return importlib.import_module(f"{package}.{name}")

@@ -262,7 +262,7 @@ DOWNLOADS: Mapping[str, PublicFile] = {
         file="armpi/my_dataset_test.mat",
     ),
 }
-"""Public files, by the names that `retwin.data.fetch` takes."""
+"""Public files by the names of their cases, which `retwin.data.fetch` takes."""
 
 _SURROGATE = ("surrogate", "")
 _OUTPUT = ("residual", "output")

@@ -272,11 +272,12 @@ def needs_extra(module: str, extra: str, purpose: str) -> ModuleType:
         ) from None
 
 
-def install_command(extra: str) -> str:
-    """The command that installs an extra of retwin, in a clone of the repository from there."""
+def install_command(extra: str = "") -> str:
+    """The command that installs retwin or an extra of it; in a clone, from there."""
+    extra = extra and f"[{extra}]"
     with suppress(PackageNotFoundError):
         about = json.loads(distribution("retwin").read_text("direct_url.json") or "{}")
         if about.get("dir_info", {}).get("editable"):
             folder = unquote(urlsplit(about["url"]).path)
-            return f'pip install -e "{folder}[{extra}]"'
-    return f'pip install "retwin[{extra}]"'
+            return f'pip install -e "{folder}{extra}"'
+    return f'pip install "retwin{extra}"'

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from numpy.typing import NDArray
 from PIL import Image
 from typer.testing import CliRunner
@@ -20,7 +19,7 @@ from retwin.cases.animation import animate
 from retwin.cases.animation.shots import Shots
 from retwin.cases.animation.solid import mujoco_pictures
 from retwin.cases.armpi_fpv.body import ArmBody
-from retwin.cli.animate import animate as command
+from retwin.cli.twins import app
 from retwin.data.io import save
 from retwin.errors import InputError
 
@@ -295,15 +294,19 @@ def test_case_that_cannot_be_drawn(short: rt.Trajectories, case: rt.Case, tmp_pa
 
 
 def test_command_line(short: rt.Trajectories, tmp_path: Path) -> None:
-    app = typer.Typer()
-    app.command()(command)
     save(short, tmp_path / "set.npz")
-    words = [str(tmp_path / "set.npz"), "--out", str(tmp_path / "arm.gif"), "--renderer", "stick"]
-    result = CliRunner().invoke(app, [*words, "--id", "second", "--fps", "2", "--size", "320x240"])
+    words = ["simulate", "armpi-kinematic", "--film", str(tmp_path / "arm.gif")]
+    settings = ["--renderer", "stick", "--fps", "2", "--size", "320x240"]
+    made = [*words, *settings, "--n", "1", "--out", str(tmp_path / "made.npz")]
+    result = CliRunner().invoke(app, made)
+    assert result.exit_code == 0, result.output
+    assert len(pictures(tmp_path / "arm.gif")) == 20, "the 10 s that were simulated"
+    words += [*settings, "--commands", str(tmp_path / "set.npz")]
+    result = CliRunner().invoke(app, [*words, "--id", "second"])
     assert result.exit_code == 0, result.output
     assert str(tmp_path / "arm.gif") in result.output
     assert pictures(tmp_path / "arm.gif")[0].shape == (240, 320, 3)
-    for wrong in (["--size", "big"], ["--id", "none"], ["--case", "none"]):
+    for wrong in (["--size", "big"], ["--id", "none"], ["--case", "none"], ["--n", "2"]):
         result = CliRunner().invoke(app, [*words, *wrong])
         assert isinstance(result.exception, InputError)
         assert result.stderr == "", "the error's own line is the only one"

@@ -67,7 +67,8 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
     assert first["probability"] == max(first["probabilities"].values())
     assert list(first["probabilities"]) == list(rt.cases.armpi().classes)
     code, out, err = call(
-        "diagnose", "invert", tmp_path / "model", files / "real.npz", "--out", tmp_path / "physics"
+        *("diagnose", "fit", files / "real.npz", "--from", tmp_path / "model"),
+        *("--out", tmp_path / "physics"),
     )
     assert code == 0, err
     rt.save(rt.load(files / "real.npz")[[0, 10]], tmp_path / "two.npz")
@@ -256,7 +257,7 @@ def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.slow
 def test_a_case_of_ones_own_without_classes(call, own: Path) -> None:
-    words = ("fit", "tank.toml", "--data", "record.csv", "--simulations", 60, "--out", "model")
+    words = ("fit", "tank.toml", "--real", "record.csv", "--simulations", 60, "--out", "model")
     words += ("--correction", "additive", "--no-yardstick")
     code, out, err = call(*words)
     assert code == 0, err
@@ -314,13 +315,12 @@ def test_a_study_of_a_case_of_ones_own(call, own: Path, words: tuple) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "either --real or --data, got none"),
-        (("--real", "a", "--data", "b"), "either --real or --data, got both"),
-        (("--data", "gone.csv"), "gone.csv: expected a table of text, got No such file"),
-        (("--data", "record.csv", "--refine"), "--refine: expected a density of one z"),
-        (("--data", "record.csv", "--density", "flow"), "density: expected SequenceMixture, for"),
-        (("--data", "record.csv", "--network", "gru"), "network: expected one of mlp, lstm"),
-        (("--data", "record.csv", "--simulations", "3"), "at least 10 trajectories"),
+        ((), "Missing option '--real'"),
+        (("--real", "gone.csv"), "--real: expected an existing file or folder, got gone.csv"),
+        (("--real", "record.csv", "--refine"), "--refine: expected a density of one z"),
+        (("--real", "record.csv", "--density", "flow"), "density: expected SequenceMixture, for"),
+        (("--real", "record.csv", "--network", "gru"), "network: expected one of mlp, lstm"),
+        (("--real", "record.csv", "--simulations", "3"), "at least 10 trajectories"),
     ],
 )
 def test_what_a_fit_cannot_be_is_one_line(call, own: Path, words: tuple, message: str) -> None:
@@ -331,10 +331,27 @@ def test_what_a_fit_cannot_be_is_one_line(call, own: Path, words: tuple, message
     assert not (own / "model").exists()
 
 
-def test_data_need_a_case_that_splits_them(call, own: Path) -> None:
-    code, _, err = call("fit", "reach.toml", "--data", "record.csv", "--out", "model")
+def test_one_way_from_a_table_to_trajectories(call, own: Path) -> None:
+    """By what a case states of its records, or by the names of the channels of a twin."""
+    code, _, err = call("fit", "reach.toml", "--real", "record.csv", "--out", "model")
     assert code == 2
-    assert "--data: expected a case that defines how its file is split, got 'reach'" in err
+    assert "record.csv: expected a column for every command, first, second" in err
+    (facts,) = json.loads(call("data", "info", "record.csv", "--case", "tank.toml", "--json")[1])
+    assert facts["trajectories"] == 2, "calibration and test"
+    whole = np.loadtxt("record.csv", delimiter=",", skiprows=1)
+    np.savetxt("a.csv", whole[:, ::2], delimiter=",", header="valve,level", comments="")
+    names = ("--case", "own_module:filled", "--inputs", "valve", "--outputs", "level")
+    code, _, err = call("data", "info", "a.csv", *names)
+    assert code == 2
+    assert "--rate" in err, "rows without times"
+    timed = np.column_stack([np.arange(100) / 4, whole[:, ::2]])
+    np.savetxt("b.csv", timed, delimiter=",", header="time,valve,level", comments="")
+    code, out, err = call("data", "info", "b.csv", *names, "--json")
+    assert code == 0, err
+    assert json.loads(out)[0]["rate"] == 4
+    free = ("--free", "gain=0.05:0.2", "--out", "identified")
+    code, out, err = call("identify", "own_module:filled", "b.csv", *names[2:], *free, "--json")
+    assert code == 0, err
 
 
 def test_a_built_in_twin_has_its_own_case(call, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def test_the_recorded_case_of_the_catalog_is_that_of_the_case(name: str) -> None
             ["Motor_2_Stuck", "Motor_2_Steady_state_error"],
         ),
         (("twin", "simulate", "mine.toml", "--fault", ""), ["none", "all", "Healthy", "leak"]),
-        (("data", "fetch", ""), ["armpi"]),
+        (("data", "convert", "--public", ""), ["armpi"]),
         (("data", "info", "re"), []),
     ],
     ids=" ".join,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from retwin.cases import data_case
 from retwin.cli import data
 from retwin.data import download
 from retwin.data.io import load, save
@@ -135,42 +136,45 @@ def test_bad_targets_are_refused_before_anything_is_read(tmp_path):
     nowhere = tmp_path / "none.npz"
     result = run("convert", nowhere, tmp_path / "a.csv", fails=InputError)
     assert ".npz or .zarr" in str(result.exception)
-    first, second = ("--out-first", tmp_path / "a.npz"), ("--out-second", tmp_path / "b.txt")
-    result = run("split", nowhere, *first, *second, fails=InputError)
-    assert "b.txt" in str(result.exception)
-    result = run("split", nowhere, *first, "--out-second", tmp_path / "a.npz", fails=InputError)
-    assert "another name" in str(result.exception)
+    (tmp_path / "b-rest.npz").mkdir()
+    result = run("convert", nowhere, tmp_path / "b.npz", "--split", 0.5, fails=InputError)
+    assert "b-rest.npz" in str(result.exception)
 
 
-def test_split_writes_two_disjoint_parts(file, tmp_path):
-    parts = ("--out-first", tmp_path / "a.npz", "--out-second", tmp_path / "b.npz")
-    run("split", file, "--fraction", 0.6, "--seed", 3, *parts)
-    first, second = load(tmp_path / "a.npz"), load(tmp_path / "b.npz")
+def test_a_split_writes_two_disjoint_parts(file, tmp_path):
+    parts = tmp_path / "a.npz", tmp_path / "a-rest.npz"
+    words = ("convert", file, parts[0], "--seed", 3, "--split")
+    run(*words, 0.6)
+    first, second = map(load, parts)
     expected, _ = load(file).split(0.6, seed=3)
     assert first.ids.tolist() == expected.ids.tolist()
     assert len(first) == 6
     assert sorted([*first.ids, *second.ids]) == load(file).ids.tolist()
-    sums = sha256(tmp_path / "a.npz"), sha256(tmp_path / "b.npz")
-    run("split", file, "--fraction", 0.6, "--seed", 3, *parts)
-    assert (sha256(tmp_path / "a.npz"), sha256(tmp_path / "b.npz")) == sums
-    result = run("split", file, "--fraction", 1.5, *parts, fails=InputError)
+    sums = [sha256(part) for part in parts]
+    run(*words, 0.6)
+    assert [sha256(part) for part in parts] == sums
+    result = run(*words, 1.5, fails=InputError)
     assert "fraction" in str(result.exception)
 
 
-def test_fetch_prints_the_path(tmp_path, monkeypatch):
-    requested = {}
+def test_a_public_file_is_fetched_and_read_by_its_case(tmp_path, monkeypatch):
+    arm, requested, file = data_case("armpi"), [], tmp_path / "fetched.npz"
+    zeros = np.zeros((2, 20, 3))
+    commands = np.zeros((2, 20, 0))
+    made = Trajectories(commands, zeros, zeros, arm.rate, outputs=arm.outputs)
+    save(made, file)
 
-    def fetch(name, *, folder, progress, max_bytes):
-        requested.update(name=name, folder=folder)
+    def fetch(name, *, progress, max_bytes):
+        requested.append((name, max_bytes))
         progress(1.0)
-        return tmp_path / "armpi" / "x.mat"
+        return file
 
     monkeypatch.setattr(download, "fetch", fetch)
-    result = run("fetch", "armpi", "--folder", tmp_path)
-    assert result.stdout.strip() == str(tmp_path / "armpi" / "x.mat")
-    assert requested == {"name": "armpi", "folder": tmp_path}
-    run("fetch", "armpi")
-    assert requested["folder"] is None
+    run("convert", tmp_path / "real.npz", "--public", "armpi")
+    assert requested == [("armpi", download.MAX_BYTES)]
+    assert load(tmp_path / "real.npz").inputs == arm.inputs
+    result = run("convert", tmp_path / "real.npz", fails=InputError)
+    assert "--public NAME" in str(result.exception)
 
 
 def test_input_errors_pass_on_to_the_caller(tmp_path):

@@ -135,7 +135,10 @@ def test_data_that_are_found(healthy: pytest.MonkeyPatch, tmp_path: Path) -> Non
     (tmp_path / "data").mkdir()
     assert found("RETWIN_DATA")[0] == "ok"
     ((name, known),) = doctor.DOWNLOADS.items()
-    assert found(f"public {name}")[::2] == ("missing", f"retwin data fetch {name}")
+    assert found(f"public {name}")[::2] == (
+        "missing",
+        f"retwin data convert --public {name} {name}.npz",
+    )
     file = tmp_path / "cache" / known.file
     file.parent.mkdir(parents=True)
     file.write_bytes(b"x")

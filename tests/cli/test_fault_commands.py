@@ -71,7 +71,7 @@ def oven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> rt.Trajectories:
 def test_faults_are_diagnosed_with_their_size(call, oven) -> None:
     for words in (
         ("fit", "oven.toml", "--dynamics", "--real", "healthy.npz", "--out", "model"),
-        ("diagnose", "invert", "model", "--out", "physics"),
+        ("diagnose", "fit", "--from", "model", "--out", "physics"),
     ):
         code, _, err = call(*words)
         assert code == 0, err
@@ -91,7 +91,7 @@ def test_faults_are_diagnosed_with_their_size(call, oven) -> None:
 
 
 def test_a_twin_in_command_space_needs_its_calibration(call, oven) -> None:
-    code, _, err = call("diagnose", "invert", "no model", "--out", "physics")
+    code, _, err = call("diagnose", "fit", "--from", "no model", "--out", "physics")
     assert code == 2
     assert "no model" in err
 

@@ -73,7 +73,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_state_equations_are_fitted_and_generate(folder: Path, tmp_path: Path, call) -> None:
     case, data, out = folder / "case.toml", folder / "d.csv", tmp_path / "model"
-    given = ("--data", data, "--dynamics", "--no-yardstick", "--out", out, "--json")
+    given = ("--real", data, "--dynamics", "--no-yardstick", "--out", out, "--json")
     code, printed, _ = call("fit", case, *given)
     assert code == 0
     found = json.loads(printed)
@@ -131,7 +131,7 @@ def test_equations_of_a_function_are_learned_first(folder: Path, tmp_path: Path,
     case, out = folder / "function.toml", tmp_path / "model"
     written = CASE.replace("state_module:tank", "tank_function:level")
     case.write_text(written.replace("[records]\n", BLACK_BOX.lstrip()))
-    given = ("--data", folder / "d.csv", "--dynamics", "--no-compare", "--out", out, "--json")
+    given = ("--real", folder / "d.csv", "--dynamics", "--no-compare", "--out", out, "--json")
     code, printed, err = call("fit", case, *given)
     assert (code, "stand in for it" in err) == (0, True), err
     found = json.loads(printed)
@@ -188,7 +188,7 @@ def test_wrong_settings_are_refused_by_name(
 ) -> None:
     case, out = folder / "wrong.toml", tmp_path / "model"
     case.write_text(CASE.replace(old, new))
-    given = ("fit", case, "--data", folder / "d.csv", "--dynamics", "--out", out)
+    given = ("fit", case, "--real", folder / "d.csv", "--dynamics", "--out", out)
     code, _, err = call(*given)
     assert (code, named in err) == (2, True), err
     assert not out.exists()
@@ -218,7 +218,7 @@ def test_an_interrupt_of_the_yardstick_leaves_the_model(
 
     monkeypatch.setattr("retwin.evaluation.choice.fitting.with_yardstick", interrupt)
     out = tmp_path / "model"
-    given = ("--data", folder / "d.csv", "--dynamics", "--no-compare", "--yardstick", "--out", out)
+    given = ("--real", folder / "d.csv", "--dynamics", "--no-compare", "--yardstick", "--out", out)
     code, _, err = call("fit", folder / "case.toml", *given)
     assert code == 130
     assert f"interrupted; {out} stays as it was saved, not compared" in err.splitlines()[-1]
@@ -231,7 +231,7 @@ def test_without_a_method_the_records_decide(folder: Path, tmp_path: Path, call)
     brisk = '[density]\nkind = "SequenceMixture"\nmembers = 2\ntraining = { max_epochs = 2 }\n'
     case = folder / "brisk.toml"
     case.write_text(CASE.replace("[records]", 'correction = "additive"\n[records]') + brisk)
-    given = ("--data", folder / "d.csv", "--no-yardstick", "--out", out, "--json")
+    given = ("--real", folder / "d.csv", "--no-yardstick", "--out", out, "--json")
     code, printed, err = call("fit", case, *given)
     assert code == 0, err
     found = json.loads(printed)

@@ -409,3 +409,17 @@ def test_a_posterior_is_drawn(place: Path, call, monkeypatch: pytest.MonkeyPatch
     low, high = found["parameters"]["gain"]["interval"]
     assert 0.05 < low < high < 0.2
     assert "posterior mean" in Path("out/report.html").read_text("utf-8")
+
+
+def test_a_function_of_an_array_per_command_is_refused(call, tmp_path, monkeypatch) -> None:
+    """Otherwise the order of --inputs would decide which is which."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    text = "def room(heater, ambient, gain=2.0):\n    return gain * heater + ambient\n"
+    Path("rooms_of_identify.py").write_text(text)
+    Path("run.csv").write_text("time,heater,ambient,air\n0,0,1,2\n1,0,1,2\n2,1,1,2\n")
+    words = ("rooms_of_identify:room", "run.csv", "--inputs", "ambient,heater", "--outputs", "air")
+    code, _, err = call("identify", *words, "--free", "gain=1:3", "--out", "identified")
+    assert code == 2
+    assert "room(heater, ambient, gain=2.0)" in err
+    assert "by names, with ambient=u[..., 0], heater=u[..., 1]" in err

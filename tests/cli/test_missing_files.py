@@ -16,7 +16,7 @@ import pytest
         ("data info no.mat", "FILES"),
         ("data convert no.mat made.npz", "IN"),
         ("twin simulate armpi --commands no.npz --out made.npz", "--commands"),
-        ("diagnose invert no real.npz --out made", "MODEL"),
+        ("diagnose fit real.npz --from no --out made", "--from"),
         ("report no", "STUDY"),
         ("monitor run", "--config"),
     ],

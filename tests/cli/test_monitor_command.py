@@ -115,7 +115,9 @@ def test_what_is_no_monitor_is_refused(watched: Path, call) -> None:
 @pytest.mark.slow
 def test_trajectories_are_watched_by_a_diagnoser(watched: Path, call, tmp_path: Path) -> None:
     case = ("--case", watched / "case.toml")
-    code, _, err = call("diagnose", "invert", watched / "model", "--out", tmp_path / "physics")
+    code, _, err = call(
+        "diagnose", "fit", "--from", watched / "model", "--out", tmp_path / "physics"
+    )
     assert code == 0, err
     twin = DynamicsTwin.load(watched / "model")
     rng = np.random.default_rng(1)

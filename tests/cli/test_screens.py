@@ -22,8 +22,7 @@ from retwin.cli.terminal import _TimeLeft, answer, bar, be_quiet, note, show_war
 from retwin.progress import FinishedStage
 
 WITHOUT_TABLES = {
-    *("data convert", "data split", "data fetch", "twin simulate", "twin animate"),
-    *("diagnose fit", "diagnose invert", "bundle save", "bundle generate", "generate", "report"),
+    *("data convert", "twin simulate", "diagnose fit", "bundle save", "generate", "report"),
     "monitor run",
 }
 """Commands that print a line at most; all others have --json."""
@@ -76,9 +75,8 @@ def test_the_help_of_a_command_fits_50_lines(narrow, name: str) -> None:
 
 
 RECORDED = (
-    *("data info", "data convert", "data split", "identify", "fit", "next", "study"),
-    *("diagnose fit", "diagnose invert", "diagnose predict", "bundle save", "bundle predict"),
-    *("monitor fit", "monitor replay"),
+    *("data info", "data convert", "identify", "fit", "generate", "next", "study"),
+    *("diagnose fit", "diagnose predict", "bundle save", "monitor fit", "monitor replay"),
 )
 """Commands that take recorded data, which may be a log."""
 
@@ -139,7 +137,7 @@ def test_json_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_json_is_alone_on_stdout(narrow) -> None:
-    code, out, err = narrow("twin", "list", "--json")
+    code, out, err = narrow("twin", "info", "--json")
     assert (code, err) == (0, "")
     printed = json.loads(out)
     assert printed.keys() == {"built_in", "forms"}
@@ -231,6 +229,16 @@ def test_a_warning_has_a_line_of_its_own_while_a_bar_is_shown(
     printed = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().err)
     assert "warning: some commands are not certain" in printed
     assert not re.search(r"left *warning", printed), "the bar is erased before it"
+
+
+def test_a_warning_is_shown_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with show_warnings():
+        for _ in range(3):
+            warnings.warn("its reset does not restore the initial state", stacklevel=1)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+        warnings.warn("another", stacklevel=1)
+    assert capsys.readouterr().err.count("warning: ") == 2
 
 
 def test_quiet_leaves_out_bars_and_notes(on_screen, capsys: pytest.CaptureFixture[str]) -> None:

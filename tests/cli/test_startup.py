@@ -74,14 +74,14 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> float:
         (("--version",), 0),
         (("--help",), 0),
         (("fit", "--help"), 0),
-        (("twin", "list"), 0),
+        (("twin", "info"), 0),
         (("twin", "info", "armpi-kinematic"), 0),
         (("data", "info", "made.npz"), 0),
         (("data", "info", "arm.npz", "--case", "armpi"), 0),
         (("data", "info", "tanks.npz", "--case", "tanks"), 0),
         (("data", "info", "nowhere", "--case", "tanks_overflow"), 2),
         (("data", "convert", "made.npz", "again.npz"), 0),
-        (("data", "fetch", "nonsense"), 2),
+        (("data", "convert", "--public", "nonsense", "made-again.npz"), 2),
         (("bundle", "verify", "nowhere"), 2),
         (("report", "nowhere"), 2),
         (("doctor",), 0),
@@ -94,3 +94,14 @@ def test_a_command_without_torch_starts_at_once(
     found, seconds, heavy = measured(COMMAND, words, folder)
     assert (found, heavy) == (code, [])
     assert seconds < FACTOR * bare
+
+
+@pytest.mark.parametrize("package", ["torch", "mujoco"])
+def test_a_missing_package_is_named_with_what_installs_it(package: str, folder: Path) -> None:
+    code = f"import sys; sys.modules[{package!r}] = None{COMMAND}"
+    words = ["fit", "armpi", "--real", "arm.npz", "--out", "made"]
+    command = [sys.executable, "-c", f"{code}", *words]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert package in done.stderr
+    assert "install what retwin needs: pip install" in done.stderr

@@ -270,8 +270,8 @@ def test_a_twin_has_its_own_channels(mine: str) -> None:
 # --- list and info -------------------------------------------------------------------------------
 
 
-def test_list_names_all_and_says_what_else(call) -> None:
-    code, out, _ = call("list")
+def test_info_without_a_name_lists_all(call) -> None:
+    code, out, _ = call("info")
     assert code == 0
     for name in (*TWINS, "FILE.fmu", "FILE.urdf", "package.module:object", "FOLDER"):
         assert name in out
@@ -424,7 +424,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
         *("simulate", f"{mine}:LIMITED", "--case", "armpi", "--out", out / "a.npz"),
     )
     words = ("simulate", "armpi-kinematic", "--duration", 8, "--out", out / "a.npz")
-    refused(call, "--duration: expected none with commands of a file or of a case", *words)
+    refused(call, "--duration: expected none with commands of a case", *words)
     assert not list(out.iterdir())
     code, _, err = call(*far, "--clip", "--out", out / "a.zarr")
     assert code == 0, err
@@ -508,3 +508,20 @@ def test_ctrl_c_says_how_to_go_on(
     assert "Wrote 600 trajectories" in err
     assert call(*words, "--out", tmp_path / "b.zarr")[0] == 0
     assert sha256(tmp_path / "a.zarr") == sha256(tmp_path / "b.zarr")
+
+
+def test_what_has_no_meaning_is_refused_before_the_work(call, tmp_path: Path) -> None:
+    film = ("--film", tmp_path / "arm.gif")
+    refused(call, "give --out FILE", "simulate", "armpi-kinematic", *film)
+    refused(
+        call,
+        "--fps: expected none without --film",
+        "simulate",
+        "armpi",
+        "--fps",
+        5,
+        "--out",
+        "a.npz",
+    )
+    words = ("simulate", "armpi", "--commands", "no.npz", *film)
+    refused(call, "--clip: expected none without --out", *words, "--clip")

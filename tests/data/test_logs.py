@@ -29,7 +29,7 @@ from retwin.data.logs.mapping import Cut, Mapping
 from retwin.data.logs.messages import Series, Types
 from retwin.data.logs.reading import read_log
 from retwin.data.logs.signals import Clock, Log, Signal, Skipped, named_unit
-from retwin.data.logs.units import compatible, converted
+from retwin.data.logs.units import compatible, converted, unit_in_name
 from retwin.data.resampling import resampled
 from retwin.data.row_times import row_times
 from retwin.errors import InputError
@@ -580,6 +580,10 @@ def test_a_function_a_case_and_an_object_give_the_channels_of_a_log(
 
         channels = rt.Channels(("valve",), ("V",)), rt.Channels(("level",), ("m",))
         tank = rt.FunctionTwin(filled, *channels, 10.0)
+        state = rt.twins.State("level", "m")
+        states = rt.twins.StateTwin(
+            (state,), lambda x, u: x.level, *channels, 10.0, derivative=lambda x, u, p: (u.valve,)
+        )
     """
     (tmp_path / "channels_of_logs.py").write_text(textwrap.dedent(code))
     monkeypatch.syspath_prepend(tmp_path)
@@ -589,6 +593,7 @@ def test_a_function_a_case_and_an_object_give_the_channels_of_a_log(
     assert function.rate == 0
     with pytest.raises(InputError, match="expected the names of the channels"):
         log_case("channels_of_logs:filled")
+    assert log_case("channels_of_logs:states").twin.rate == 10.0
     tank = log_case("channels_of_logs:tank")
     assert (tank.rate, tank.outputs) == (10.0, rt.Channels(("level",), ("m",)))
     assert log_case("retwin.cases.cascaded_tanks.case:tanks").classes == ("Healthy",)
@@ -608,6 +613,29 @@ def test_a_function_a_case_and_an_object_give_the_channels_of_a_log(
     made = load(tmp_path / "run.csv", case=tank, mapping=tmp_path / "m.toml")
     assert made.outputs == tank.outputs
     assert made.observed.max() == pytest.approx(0.06), "cm"
+
+
+def test_a_unit_in_the_name_of_a_signal_is_converted(tmp_path: Path) -> None:
+    rows = [f"{t / 10},{t % 7},{10 * t}" for t in range(50)]
+    (tmp_path / "run.csv").write_text("\n".join(["time,valve_pos_ref,level_mm", *rows]))
+    twin = TwinData(rt.Channels(("valve",), ("1",)), rt.Channels(("level",), ("m",)))
+    (tmp_path / "m.toml").write_text(propose_mapping(tmp_path / "run.csv", case=twin).text)
+    made = load(tmp_path / "run.csv", mapping=tmp_path / "m.toml")
+    assert made.outputs == twin.outputs
+    assert made.observed.max() == pytest.approx(0.49)
+    facts = propose_mapping(tmp_path / "run.csv").facts
+    assert [each.unit for each in facts] == ["", "mm"], "a reference is in no unit"
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        *[("speed_m_s", "m/s"), ("a_m_s2", "m/s^2"), ("valve_pct", "%"), ("torque_Nm", "N m")],
+        *[("mm", ""), ("x_cmd", ""), ("phase_A", ""), ("alarms", "")],
+    ],
+)
+def test_units_at_the_end_of_names(name: str, unit: str) -> None:
+    assert unit_in_name(name) == unit
 
 
 def test_a_command_of_another_unit_is_not_taken_for_the_one_that_is_left(tmp_path: Path) -> None:

@@ -147,8 +147,8 @@ def test_the_command_line_writes_it_from_a_fitted_model(tmp_path: Path, call) ->
     )
     assert code == 0, err
     net = tmp_path / "net.pt"
-    words = ("export", "actuator-net", model, "--history", "0,2", "--json", "--out", net)
-    code, out, err = call(*words, "--joint", "target,angle,torque")
+    words = ("export", "actuator", model, "--history", "0,2", "--json", "--out", net)
+    code, out, err = call(*words, "--torque", "target,angle,torque")
     assert code == 0, err
     printed = json.loads(out)
     assert (printed["input_idx"], printed["period"], printed["unit"]) == ([0, 2], 0.05, "N m")
@@ -160,7 +160,7 @@ def test_the_command_line_writes_it_from_a_fitted_model(tmp_path: Path, call) ->
         ("target,angle", "TARGET,POSITION,TORQUE,VELOCITY"),
         ("target,angle,torque,", "TARGET,POSITION,TORQUE,VELOCITY"),
     ):
-        code, _, err = call(*words, "--joint", joint)
+        code, _, err = call(*words, "--torque", joint)
         assert (code, part in err, net.exists()) == (2, True, False), err
-    code, _, err = call(*words, "--joint", "target,angle,torque", "--history", "0,x")
+    code, _, err = call(*words, "--torque", "target,angle,torque", "--history", "0,x")
     assert (code, "--history" in err) == (2, True), err

@@ -59,13 +59,13 @@ def test_unmeasured_rows_and_a_sentinel(folder: Path) -> None:
         text = "\n".join([header, *rows[:500], *changed, *rows[520:]])
         (folder / f"{name}.csv").write_text(text)
     words = "--simulations 20 --no-yardstick --out"
-    retwin(folder, f"fit duffing.toml --data nan.csv {words} holes")
+    retwin(folder, f"fit duffing.toml --real nan.csv {words} holes")
     retwin(folder, "generate holes --per-class 2 --out holes.npz")
     with np.load(folder / "holes.npz") as made:
         assert np.isfinite(made["observed"]).all()
-    ended = retwin(folder, f"fit duffing.toml --data sentinel.csv {words} wrong", code=2)
+    ended = retwin(folder, f"fit duffing.toml --real sentinel.csv {words} wrong", code=2)
     *notes, line = ended.lines
     assert all("3.4e+38" in each for each in notes), notes
-    assert line.startswith("error: calibration.observed: ")
-    assert "3.4e+38 of x" in line
+    assert line.startswith("error: calibration-1: expected numbers below ")
+    assert "3.4e+38 for x" in line
     assert not (folder / "wrong").exists()

@@ -30,7 +30,7 @@ def model(folder: Path) -> Path:
     retwin(folder, "twin simulate six.toml --n 300 --fault all --out simulated.npz")
     words = "--real calibration --twin-data simulated.npz --out model --json"
     (folder / "fit.json").write_text(retwin(folder, f"fit six.toml {words}").out)
-    retwin(folder, "diagnose invert model calibration --out physics")
+    retwin(folder, "diagnose fit calibration --from model --out physics")
     return folder / "model"
 
 
@@ -47,9 +47,8 @@ def test_runs_are_described_and_split(folder: Path) -> None:
     (facts,) = retwin(folder, "data info test --case six.toml --json").json
     assert facts["per_class"] == {"Healthy": 5} | dict.fromkeys(six_joints.FAULTS, 1)
     assert (facts["samples"], facts["rate"], facts["missing"]) == (200, 25, 0)
-    parts = "--out-first first.npz --out-second second.npz"
-    retwin(folder, f"data split calibration --case six.toml --fraction 0.5 {parts}")
-    found = retwin(folder, "data info first.npz second.npz --json").json
+    retwin(folder, "data convert calibration first.npz --case six.toml --split 0.5")
+    found = retwin(folder, "data info first.npz first-rest.npz --json").json
     assert [each["trajectories"] for each in found] == [3, 3]
 
 
@@ -87,7 +86,7 @@ def test_what_the_bundle_was_not_made_for(folder: Path, model: Path) -> None:
         np.savetxt(file, table, delimiter=",", fmt="%.7g")
     retwin(folder, "diagnose fit simulated.npz --case six.toml --rate 25 --out cnn")
     retwin(folder, "bundle save model calibration --diagnoser cnn --out sealed")
-    words = "bundle predict sealed odd --case six.toml --out odd.csv --json"
+    words = "diagnose predict sealed odd --case six.toml --out odd.csv --json"
     found = retwin(folder, words).json["trajectories"]
     with (folder / "odd.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -96,10 +95,10 @@ def test_what_the_bundle_was_not_made_for(folder: Path, model: Path) -> None:
     classes = ["Healthy", *six_joints.FAULTS]
     for each, row in zip(found, rows, strict=True):
         assert row["guard"] == each["guard"]
-        assert row["because_of"] == each["because_of"]
+        assert row["reason"] == each["reason"]
         values = [each["probability"], *each["probabilities"].values()]
         if each["guard"] == "outside":
-            assert each["because_of"]
+            assert each["reason"]
             assert each["diagnosis"] == "unknown"
             assert values == [None] * (1 + len(classes))
             assert [row[name] for name in classes] == [""] * len(classes)

@@ -41,15 +41,9 @@ POSSIBLE = {
     "1e-300": {"rate", "seconds", "hold_out"},
 }
 """Options for which an odd number may be accepted."""
-LONG_WORK = (
-    *("bench", "data fetch", "demo", "diagnose fit", "export actuator-net", "fit"),
-    *("monitor demo", "study"),
-)
+LONG_WORK = (*("demo", "diagnose fit", "export actuator", "fit", "monitor run", "study"),)
 """Commands that work for a long time, or download, on what they accept; it is not tried."""
-NOT_RUN = (
-    *("bench", "bundle export", "data fetch", "demo", "doctor", "export actuator-net"),
-    *("monitor demo", "study"),
-)
+NOT_RUN = (*("demo", "doctor", "export actuator", "export onnx", "monitor run", "study"),)
 """Commands of which only the reading of words is tried with mutated ones: they work for a long
 time, or need a network."""
 ODD_WORDS = ("", "-", "--", "-1", "nan", HUGE, "x" * 300, "none", "..", "set", "study", "--seed")
@@ -60,37 +54,28 @@ NO_PLACE = ("/", "/proc/none", "reach.toml/none", LONG, f"none/{LONG}", "study",
 """Names at which nothing can be written: the last but one is the folder of another study."""
 
 BASE = {
-    "bench": "",
-    "bundle export": "sealed",
-    "bundle generate": "sealed --case reach.toml --per-class 1",
-    "bundle predict": "sealed real.npz",
     "bundle save": "model real.npz --case reach.toml",
     "data convert": "set",
-    "data fetch": "armpi",
     "data info": "set",
     "data map": "log.csv",
-    "data split": "real.npz",
     "demo": "--runs 1",
     "diagnose fit": "real.npz",
-    "diagnose invert": "model real.npz",
     "diagnose predict": "cnn real.npz",
     "fit": "reach.toml --real real.npz --simulations 20",
     "generate": "model --case reach.toml --per-class 1",
     "evaluate": "model --real real.npz --case reach.toml",
     "export actuator": "model --torchscript-only",
-    "export actuator-net": "model --joint second,far,high",
     "export fmu": "model",
+    "export onnx": "sealed",
     "identify": "own_of_mutations:reach real.npz --inputs first,second --outputs far,high --rate 10"
     " --free length=0.5:2",
     "monitor audit": "alarms.jsonl",
-    "monitor demo": "--seconds 1 --port 0",
     "monitor fit": "model real.npz",
     "monitor recalibrate": "store --asset press",
     "monitor replay": "model real.npz",
     "monitor run": "--config reach.toml",
     "next": "reach.toml model --real real.npz --candidates 5 --count 1",
     "study": "reach.toml --real real.npz --folds 2 --sources dt,ibg --runs 1 --per-class 5",
-    "twin animate": "real.npz --case reach.toml",
     "twin info": "own_of_mutations:reach --inputs first,second --outputs far,high",
     "twin simulate": "reach.toml --n 2",
 }
@@ -116,8 +101,9 @@ def is_number(parameter: Any) -> bool:
 
 def is_target(parameter: Any) -> bool:
     """Whether it names what a command writes."""
-    written = ("out", "onnx", "first", "second", "folder")
-    return parameter.name == "target" or (parameter.name in written and is_option(parameter))
+    if is_option(parameter):
+        return bool(parameter.name == "out")
+    return str(parameter.metavar).endswith("OUT")
 
 
 def is_odd(parameter: Any) -> bool:
@@ -128,8 +114,7 @@ def suffix(name: str, target: Any) -> str:
     """The suffix that a command wants of that name."""
     if target.metavar == "FOLDER":
         return ""
-    own = {"data map": ".toml", "export actuator-net": ".pt"}
-    own["twin animate"] = ".gif"
+    own = {"data map": ".toml"}
     return own.get(name, ".csv" if "predict" in name else ".npz")
 
 
@@ -156,7 +141,7 @@ def cases() -> Iterator[tuple[str, list[str], bool]]:
                 if not (possible and name in LONG_WORK):
                     yield name, [*words({}), option.opts[0], value], possible
         for place in places:
-            for value in NO_PLACE[1:5] if name == "data fetch" else NO_PLACE:
+            for value in NO_PLACE:
                 ending = suffix(name, place)
                 odd = value + ending if value and value not in ("/", "study") else value
                 yield name, words({place.name: odd}), False

@@ -79,14 +79,14 @@ class Format:
 
 
 LOGS = ("csv", "feather", "mcap", "mf4", "parquet", "tdms")
-SEALED = ("bundle verify sealed", "bundle predict sealed real.npz")
+SEALED = ("bundle verify sealed", "diagnose predict sealed real.npz")
 FORMATS = {
     "npz": Format(
         "a.npz",
         (
             "data info a.npz",
             "data convert a.npz made.npz",
-            "data split a.npz --out-first made.npz --out-second other.npz",
+            "data convert a.npz made.npz --split 0.6",
             "twin simulate case.toml --commands a.npz --out made.npz",
         ),
     ),
@@ -107,7 +107,7 @@ FORMATS = {
     "diagnoser": Format("cnn", ("diagnose predict cnn real.npz",)),
     "bundle": Format(
         "sealed",
-        (*SEALED, "bundle generate sealed --case case.toml --per-class 1 --out made.npz"),
+        (*SEALED, "generate sealed --case case.toml --per-class 1 --out made.npz"),
     ),
     "onnx": Format("sealed", SEALED),
     "results": Format("study/results.json", ("report study",)),

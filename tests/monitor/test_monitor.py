@@ -294,6 +294,33 @@ def test_the_cause_of_an_alarm_is_named_with_its_onset_and_size(
         find_causes(twin, watched[[0]], first, faults)
 
 
+def named_causes(monitor: Monitor, watched: rt.Trajectories) -> tuple[list[str], int]:
+    """The causes of the first event until 42 s, and the number of its alarms."""
+    alarms = monitor.watch(watched).alarms
+    event = [each for each in alarms if each.event == alarms[0].event and each.time < 42]
+    found = find_causes(monitor.twin, watched, event, possible_causes(monitor.twin))
+    return [each.name for each in found if not each.same], len(found)
+
+
+@pytest.mark.parametrize("end", [None, 40.0])
+def test_a_fault_that_lasts_or_ends_is_the_only_cause_of_its_event(
+    monitor: Monitor, end: float | None
+) -> None:
+    leak = ParameterShift("drain", size=1.3, onset=30.0, end=end)
+    names, count = named_causes(monitor, record(1, 5, faults=[leak]))
+    assert names == ["drain changed"]
+    assert count > 1, "further alarms belong to the event"
+
+
+def test_a_second_fault_in_an_event_is_named(monitor: Monitor) -> None:
+    leak = ParameterShift("drain", size=1.3, onset=30.0, end=33.0)
+    one = record(1, 5, faults=[leak])
+    both = one.observed.copy()
+    both[:, 345:, 1] += 1.0
+    names, _ = named_causes(monitor, one.replace(observed=both))
+    assert names == ["drain changed", "pressure: sensor offset"]
+
+
 @pytest.mark.parametrize(
     ("fault", "name"),
     [

@@ -1,8 +1,7 @@
-"""`retwin monitor demo`: one command, and the page shows an alarm with its cause."""
+"""`retwin monitor run --demo`: one command, and the page shows an alarm with its cause."""
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -16,7 +15,7 @@ SECONDS = 75
 
 
 def test_the_demo_shows_an_alarm_with_its_cause() -> None:
-    command = [sys.executable, "-m", "retwin", "--quiet", "monitor", "demo", "--json"]
+    command = [sys.executable, "-m", "retwin", "--quiet", "monitor", "run", "--demo"]
     command += ["--port", "0", "--seconds", str(SECONDS)]
     began = time.monotonic()
     running = subprocess.Popen(
@@ -24,11 +23,8 @@ def test_the_demo_shows_an_alarm_with_its_cause() -> None:
     )
     try:
         assert running.stdout is not None
-        text = b""
-        while not text.endswith(b"}\n"):
-            text += running.stdout.readline()
+        address = running.stdout.readline().decode().removeprefix("Page: ").strip()
         started = time.monotonic()
-        address = json.loads(text)["address"]
         with httpx.Client(base_url=address, timeout=60) as client:
             assert client.get("/assets").json()["emulated"]
             alarms: list = []

@@ -16,6 +16,7 @@ from retwin.data.logs.mapping import Mapping, read_mapping
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins import FILES
+from retwin.twins.twin import Twin
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class TwinData:
         takes that of the log.
     classes : tuple of str
         None are known, so that any are taken.
+    twin : Twin or None
+        The twin itself, where it has a sample rate.
 
     """
 
@@ -38,6 +41,7 @@ class TwinData:
     outputs: Channels
     rate: float = 0.0
     classes: tuple[str, ...] = ()
+    twin: Twin | None = None
 
     def measured(self, mapping: Mapping) -> TwinData:
         """The same with those of its outputs that a mapping has."""
@@ -57,10 +61,11 @@ class TwinData:
 
 def log_case(
     name: str,
-    *,
     inputs: Sequence[str] = (),
     outputs: Sequence[str] = (),
+    *,
     mapping: str | os.PathLike[str] | None = None,
+    rate: float | None = None,
 ) -> DataCase:
     """The case of that name, or the channels of a twin that is none.
 
@@ -73,6 +78,8 @@ def log_case(
         Names of the channels: those of a function, or some of a file's.
     mapping : path, optional
         A mapping.toml; of a twin that is no case, outputs that it lacks are left out.
+    rate : float, optional
+        The sample rate of the log in Hz, for a twin that has none of its own.
 
     Raises
     ------
@@ -94,9 +101,12 @@ def log_case(
         got=f"inputs {', '.join(inputs) or 'none'}, outputs {', '.join(outputs) or 'none'}",
         remedy="name both, joined by commas",
     )
-    twin = twins.get(name, inputs=inputs, outputs=outputs, rate=1.0 if function else None)
-    rate = 0.0 if is_file or function else twin.rate
-    made = TwinData(twin.inputs, twin.outputs, rate)
+    free = is_file or function
+    twin = twins.get(name, inputs=inputs, outputs=outputs, rate=rate or (1.0 if function else None))
+    known = not free or rate is not None
+    made = TwinData(
+        twin.inputs, twin.outputs, twin.rate if known else 0.0, twin=twin if known else None
+    )
     return made if mapping is None else made.measured(read_mapping(mapping))
 
 
@@ -112,15 +122,13 @@ def _is_case(name: str) -> bool:
     from retwin.cases.case import Case  # which needs torch
 
     found = _object(name)
-    if callable(found) and not _takes_commands(name):
+    if callable(found) and not isinstance(found, Twin) and not _takes_commands(name):
         found = found()
     return isinstance(found, Case)
 
 
 def _takes_commands(name: str) -> bool:
     """Whether a name stands for a function of commands, which no twin is."""
-    from retwin.twins.twin import Twin
-
     found = _object(name)
     if not callable(found) or (isinstance(found, Twin) and not isinstance(found, type)):
         return False

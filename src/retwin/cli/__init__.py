@@ -1,7 +1,7 @@
 """The command line: parses arguments, calls the public interface, prints results.
 
-Belongs here: commands, options, completion, messages on a terminal, `doctor` and `bench`. Not
-here: anything that computes a result.
+Belongs here: commands, options, completion, messages on a terminal, and `doctor`. Not here:
+anything that computes a result.
 
 Exit codes: 0 done; 1 failed; 2 bad input, with one line that states what was expected, what came
 and the remedy; 130 interrupted. With RETWIN_TRACEBACK=1 in the environment, the traceback of an
@@ -20,7 +20,6 @@ import typer
 
 from retwin._version import __version__
 from retwin.cli import (
-    bench,
     bundle,
     data,
     diagnose,
@@ -77,7 +76,6 @@ app = Commands(
 )
 app.command(epilog=example("retwin demo"))(studies.demo)
 app.command(epilog=example("retwin doctor"))(doctor.doctor)
-app.command(hidden=True, epilog=example("retwin bench"))(bench.bench)
 app.command(
     epilog=example("retwin identify plant.fmu log.csv --free gain=0.1:10 --out identified")
 )(identify.identify)

@@ -38,11 +38,6 @@ def complete_twins(incomplete: str) -> list[tuple[str, str]]:
     return [(name, title) for name, title in titles if name.startswith(incomplete)]
 
 
-def complete_files(incomplete: str) -> list[str]:
-    """Complete to a public data file."""
-    return one_of(sorted(catalog.DOWNLOADS))(incomplete)
-
-
 def complete_faults(ctx: typer.Context, incomplete: str) -> list[str]:
     """Complete to a class of the case, or of the twin's own case, that the command names."""
     # While an option lacks its value, click leaves the arguments in `args`.

@@ -1,17 +1,19 @@
-"""`retwin data`: describe, map, convert, split and fetch trajectories."""
+"""`retwin data`: describe, map and convert trajectories."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.table import Table
 
-from retwin.checks import ends_in, nothing, require
+from retwin.catalog import DOWNLOADS
+from retwin.checks import at_least, ends_in, given
 from retwin.cli.commands import Commands
-from retwin.cli.completion import complete_files
 from retwin.cli.options import (
     CaseOption,
     Inputs,
@@ -24,12 +26,15 @@ from retwin.cli.options import (
     argument,
     case_option,
     channel_names,
+    leave_out,
     option,
+    rare,
 )
-from retwin.cli.reading import data_case, read, shown_records
+from retwin.cli.reading import case_named, data_case, read, shown_records
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
 from retwin.data.io import DataCase, check_target, save
+from retwin.data.logs.reading import is_log
 from retwin.data.quality.check import check_records
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.serialisation.files import sha256, write_atomically
@@ -45,11 +50,9 @@ SHOWN = 40
 """Signals of a log that are listed."""
 
 app = Commands(
-    help="Describe, map, convert, split and fetch trajectories.",
+    help="Describe, map and convert trajectories.",
     epilog=example("retwin data info real.mat --case armpi"),
 )
-
-File = Annotated[Path, argument("FILE", "File or folder of trajectories.", show_default=False)]
 
 ChannelsOf = Annotated[
     str | None,
@@ -69,7 +72,13 @@ def info(
     as_json: Json = False,
 ) -> None:
     """Describe files: classes, samples, channels, missing values, SHA-256."""
-    system = _channels_of(case, inputs, outputs, mapping)
+    rate_of = None
+    if mapping is None and is_log(files[0]) and files[0].is_file():
+        from retwin.cases import LogReader
+
+        reader = LogReader(max_bytes=max_bytes)
+        rate_of = partial(reader.rate, files[0]) if rate is None else (lambda _: rate)
+    system = _channels_of(case, inputs, outputs, mapping, rate_of)
     facts, shown = [], []
     for file in files:
         found = read(file, system, rate, max_bytes=max_bytes, mapping=mapping)
@@ -84,9 +93,9 @@ def map_log(
     log: Annotated[Path, argument("LOG", "ROS bag, MCAP, Parquet, TDMS, MDF, CSV, …")],
     out: Annotated[Path, option("FILE", "New mapping.toml; its picture beside.")],
     case: ChannelsOf = None,
-    time: Annotated[str, option("COLUMN", "Column of the times, if not found.", "--time")] = "",
+    time: Annotated[str, rare("COLUMN", "Column of the times, if not found.", "--time")] = "",
     rate: Annotated[
-        float | None, option("HZ", "Rows per second, if it has no times.", "--rate")
+        float | None, rare("HZ", "Rows per second, if it has no times.", "--rate")
     ] = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
@@ -105,7 +114,7 @@ def map_log(
         check_place(place)
     if rate is not None:
         rate = sample_rate("--rate", rate)
-    system = _channels_of(case, inputs, outputs, None)
+    system = _channels_of(case, inputs, outputs)
     with bar("map") as show:
         made = propose_mapping(
             log,
@@ -136,91 +145,84 @@ def map_log(
         note(f"No signal that changes was found for {lacking}: name it in {out}")
     for each in remarks:
         note(each)
+    if case is None:
+        commands = ", ".join(made.mapping.commands if made.mapping else ()) or "none"
+        note(
+            f"Commands, by words in names: {commands}; all others are outputs. Move what is sent "
+            f"to the machine to [commands] in {out}, or give --case TWIN"
+        )
 
 
 @app.command(epilog=example("retwin data convert sim.mat sim.npz --case armpi"))
 def convert(
-    source: Annotated[Path, argument("IN", "File or folder to read.")],
-    target: Annotated[Path, argument("OUT", "New *.npz or *.zarr.")],
-    case: CaseOption = None,
-    rate: Rate = None,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
-) -> None:
-    """Write trajectories in retwin's own format, with channels, rate and provenance."""
-    check_target(target)
-    trajectories = read(source, data_case(case), rate, max_bytes=max_bytes, mapping=mapping)
-    save(trajectories, target)
-    note(f"Wrote {target}: {trajectories}")
-
-
-@app.command(epilog=example("retwin data split real.npz --out-first fit.npz --out-second test.npz"))
-def split(
-    file: File,
-    first: Annotated[Path, option("FILE", "First part, *.npz or *.zarr.", "--out-first")],
-    second: Annotated[Path, option("FILE", "The rest, *.npz or *.zarr.", "--out-second")],
-    fraction: Annotated[float, option("X", "Share of the first part.")] = 0.6,
+    files: Annotated[
+        list[Path], argument("IN… OUT", "Files or folders to read, and a new *.npz or *.zarr.")
+    ],
+    public: Annotated[
+        str | None,
+        option("NAME", "Read a public data file, such as armpi.", names=sorted(DOWNLOADS)),
+    ] = None,
+    split: Annotated[
+        float | None, option("SHARE", "Of each class to OUT; the rest goes to OUT-rest.")
+    ] = None,
     seed: Seed = 0,
     case: CaseOption = None,
     rate: Rate = None,
     mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
 ) -> None:
-    """Split trajectories in two, at random, with the same shares of every class."""
-    for target in (first, second):
-        check_target(target)
-    require(
-        first.resolve() != second.resolve(),
-        "--out-second",
-        expected="another name than --out-first",
-        got=second,
-        remedy="give each part its own file",
-    )
-    whole = read(file, data_case(case), rate, max_bytes=max_bytes, mapping=mapping)
-    parts = whole.split(fraction, seed=seed)
-    for part, target in zip(parts, (first, second), strict=True):
-        save(part, target)
-        note(f"Wrote {target}: {part}")
+    """Write trajectories in retwin's own format, with channels, rate and provenance.
 
-
-@app.command(epilog=example("retwin data fetch armpi --folder data"))
-def fetch(
-    name: Annotated[
-        str,
-        argument(
-            "NAME", "Name of a public data file, such as armpi.", autocompletion=complete_files
-        ),
-    ],
-    folder: Annotated[
-        Path | None, option("FOLDER", "Else RETWIN_CACHE, else the user's cache.")
-    ] = None,
-    max_bytes: Annotated[
-        int, option("N", "Most that the file may hold.", min=1)
-    ] = download.MAX_BYTES,
-) -> None:
-    """Download a public data file, check its SHA-256 and print its path."""
-    with bar("fetch") as show:
-        path = download.fetch(
-            name, folder=folder, progress=lambda share: show(name, share), max_bytes=max_bytes
-        )
-    answer(path, str(path))
+    A public file is downloaded to RETWIN_CACHE, else the user's cache, and its
+    SHA-256 is checked.
+    """
+    *sources, target = files
+    targets = [target] if split is None else [target, target.with_stem(f"{target.stem}-rest")]
+    for each in targets:
+        check_target(each)
+    if public is not None:
+        with bar("fetch") as show:
+            sources.append(
+                download.fetch(
+                    public,
+                    progress=lambda share: show(public, share),
+                    max_bytes=max_bytes or download.MAX_BYTES,
+                )
+            )
+    at_least("IN", sources, 1, "file", remedy="name it before OUT, or give --public NAME")
+    found = read(sources, case or public, rate, max_bytes=max_bytes, mapping=mapping)
+    parts = [found] if split is None else found.split(split, seed=seed)
+    for part, place in zip(parts, targets, strict=True):
+        save(part, place)
+        note(f"Wrote {place}: {part}")
 
 
 def _channels_of(
-    name: str | None, inputs: str, outputs: str, mapping: Path | None
+    name: str | None,
+    inputs: str,
+    outputs: str,
+    mapping: Path | None = None,
+    rate_of: Callable[[Sequence[str]], float | None] | None = None,
 ) -> DataCase | None:
-    """What files need of the case or the twin of that name, if one is given."""
-    names = [channel_names(each) for each in (inputs, outputs)]
+    """What files need of the case or the twin of that name, if one is given.
+
+    `rate_of` gives the sample rate of channels in a log, for a twin that has none of its own.
+    """
     if name is None:
-        expected = "the twin to which they belong, --case plant.fmu or module:function"
-        remedy = "give --case too, or leave them out"
-        nothing("--inputs, --outputs", (*names[0], *names[1]), expected, remedy=remedy)
+        options = {"--inputs": inputs or None, "--outputs": outputs or None}
+        leave_out(options, "without --case, the twin to which they belong")
         return None
+    names = (channel_names(inputs), channel_names(outputs))
     if Path(name).suffix.lower() not in FILES and ":" not in name and not any(names):
-        return data_case(name)
+        return data_case(name) if rate_of is None else case_named(name)
     from retwin.cases.twin_data import log_case
 
-    return log_case(name, inputs=names[0], outputs=names[1], mapping=mapping)
+    made = log_case(name, *names, mapping=mapping)
+    if rate_of is None or made.rate:
+        return made
+    found = rate_of((*made.inputs.names, *made.outputs.names))
+    rate = given("--rate", found, "a column with the times of the rows", remedy="give --rate HZ")
+    return log_case(name, *names, rate=rate)
 
 
 def _remarks(made: Proposal, tried: Parts | str) -> list[str]:

@@ -147,4 +147,5 @@ def _data() -> Iterator[Found]:
     for name, known in DOWNLOADS.items():
         there = (cache / known.file).is_file()
         found = str(cache / known.file) if there else f"not in {cache}"
-        yield f"public {name}", "missing", found, "" if there else f"retwin data fetch {name}"
+        remedy = "" if there else f"retwin data convert --public {name} {name}.npz"
+        yield f"public {name}", "missing", found, remedy

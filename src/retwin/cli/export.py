@@ -7,8 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from retwin.checks import require
 from retwin.cli.commands import Commands
-from retwin.cli.options import Json, OtherCase, Seed, argument, channel_names, option
-from retwin.cli.reading import system_of, updated_twin
+from retwin.cli.options import (
+    Json,
+    OtherCase,
+    Seed,
+    argument,
+    channel_names,
+    leave_out,
+    option,
+    rare,
+)
+from retwin.cli.reading import saved, system_of, updated_twin
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.errors import InputError
 from retwin.serialisation.places import check_place
@@ -34,7 +43,7 @@ def fmu(
     out: Annotated[Path, option("FILE", "The FMU to write, *.fmu.")],
     version: Annotated[Literal["2.0", "3.0"], option("FMI", "Version of FMI: 2.0 or 3.0.")] = "2.0",
     source_only: Annotated[
-        bool, option("", "Write no binary for this machine.", "--source-only")
+        bool, rare("", "Write no binary for this machine.", "--source-only")
     ] = False,
     case: OtherCase = None,
     as_json: Json = False,
@@ -72,27 +81,73 @@ def fmu(
     note(f"Saved {out}")
 
 
+@app.command(epilog=example("retwin export onnx bundle --out portable"))
+def onnx(
+    folder: Annotated[Path, argument("BUNDLE", "Folder of a bundle, of retwin bundle save.")],
+    out: Annotated[Path, option("FOLDER", "Where to put the ONNX graphs.")],
+    as_json: Json = False,
+) -> None:
+    """Write a bundle as ONNX graphs, with which `diagnose predict` needs no torch."""
+    from retwin.deploy.bundle.bundle import Bundle
+    from retwin.deploy.onnx.export import export_onnx
+
+    check_place(out, folder=True)
+    with bar("export") as show:
+        parity = export_onnx(Bundle.load(saved(folder)), out, progress=lambda s: show("", s))
+    rows = [(name, f"{difference:.1e}") for name, difference in parity.items()]
+    answer(
+        {"saved": str(out), "differences": parity},
+        table(("graph", "difference from torch"), rows, numbers=("difference from torch",)),
+        as_json=as_json,
+    )
+    note(f"Wrote {out}")
+
+
 @app.command(epilog=example("retwin export actuator model --out actuator --period 0.005"))
 def actuator(
-    model: Annotated[Path, argument("MODEL", "Folder of a corrected twin, of retwin fit.")],
-    out: Annotated[Path, option("DIR", "The folder to write.")],
+    model: Annotated[Path, argument("MODEL", "Folder of an updated twin, of retwin fit.")],
+    out: Annotated[Path, option("DIR", "The folder to write; with --torque a network, *.pt.")],
     period: Annotated[
         float | None, option("S", "Seconds between two steps; else the sample period.")
     ] = None,
-    draws: Annotated[int, option("N", "Draws of the discrepancy.")] = 16384,
+    draws: Annotated[int | None, rare("N", "Draws of the discrepancy; else 16384.")] = None,
     torchscript_only: Annotated[
-        bool, option("", "Write no ONNX graph.", "--torchscript-only")
+        bool, rare("", "Write no ONNX graph.", "--torchscript-only")
     ] = False,
+    torque: Annotated[
+        list[str] | None,
+        option(
+            "NAMES",
+            "Learn the torque instead: channels TARGET,POSITION,TORQUE[,VELOCITY]; "
+            "repeat it for equal actuators.",
+        ),
+    ] = None,
+    history: Annotated[str | None, rare("STEPS", "Of --torque, into the past; else 0,1,2.")] = None,
     case: OtherCase = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Write what the actuators execute, for many simulated robots at once."""
+    """Write what the actuators execute, for many simulated robots at once.
+
+    With --torque, write the torque by position errors and velocities, where
+    torque is an output of the twin.
+    """
+    if torque:
+        others = {"--period": period, "--draws": draws, "--torchscript-only": torchscript_only}
+        leave_out(others, "with --torque")
+    else:
+        leave_out({"--history": history}, "without --torque")
+    joints = [_joint(each) for each in torque or ()]
+    steps = _steps(history or "0,1,2")
+    check_place(out, folder=not torque)
+    twin = updated_twin(model)
+    if torque:
+        _write_torque(twin, out, joints, steps, _sampled(twin, model, case, seed), seed, as_json)
+        return
     from retwin.deploy.actuator.draws import causal_part
     from retwin.deploy.actuator.export import export_actuator
 
-    check_place(out, folder=True)
-    twin, _ = causal_part(updated_twin(model))
+    twin, _ = causal_part(twin)
     commands = _sampled(twin, model, case, seed)
     with bar("export") as show:
         show("compile", 0.0)
@@ -102,35 +157,24 @@ def actuator(
             commands=commands,
             seed=seed,
             period=period,
-            draws=draws,
+            draws=16384 if draws is None else draws,
             onnx=not torchscript_only,
         )
     _print_actuator(made, out, as_json=as_json)
 
 
-@app.command(epilog=example("retwin export actuator-net model --joint u,angle,torque --out net.pt"))
-def actuator_net(
-    model: Annotated[Path, argument("MODEL", "Folder of an updated twin, of retwin fit.")],
-    joint: Annotated[
-        list[str],
-        option(
-            "NAMES", "Channels TARGET,POSITION,TORQUE[,VELOCITY]. Repeat it for equal actuators."
-        ),
-    ],
-    out: Annotated[Path, option("FILE", "The network to write, *.pt.")],
-    history: Annotated[str, option("STEPS", "Into the past, joined by commas.")] = "0,1,2",
-    case: OtherCase = None,
-    seed: Seed = 0,
-    as_json: Json = False,
+def _write_torque(
+    twin: Any,
+    out: Path,
+    joints: list[Joint],
+    history: tuple[int, ...],
+    commands: NDArray,
+    seed: int,
+    as_json: bool,
 ) -> None:
-    """Write the torque by position errors and velocities, where torque is an output."""
+    """Write the network of torques, and print the settings with which simulators load it."""
     from retwin.deploy.actuator.torque_net import export_actuator_net
 
-    joints = [_joint(each) for each in joint]
-    steps = _steps(history)
-    check_place(out)
-    twin = updated_twin(model)
-    commands = _sampled(twin, model, case, seed)
     with bar("export") as show:
         made = export_actuator_net(
             twin,
@@ -138,7 +182,7 @@ def actuator_net(
             joints=joints,
             commands=commands,
             seed=seed,
-            history=steps,
+            history=history,
             progress=lambda share: show("train", share),
         )
     settings = {
@@ -161,13 +205,13 @@ def actuator_net(
 
 
 def _joint(text: str) -> Joint:
-    """The channels in a value of --joint."""
+    """The channels in a value of --torque."""
     from retwin.deploy.actuator.torque_net import Joint
 
     names = channel_names(text)
     require(
         len(names) in (3, 4) and len(names) == text.count(",") + 1,
-        "--joint",
+        "--torque",
         expected="TARGET,POSITION,TORQUE or TARGET,POSITION,TORQUE,VELOCITY",
         got=repr(text),
         remedy="name a command and two or three outputs of the twin; `retwin data info` of its "

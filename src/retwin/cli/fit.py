@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from retwin import catalog
-from retwin.checks import given, require
-from retwin.checks import one_of as in_catalog
-from retwin.cli.completion import one_of
-from retwin.cli.options import CaseArgument, Horizon, Json, LogMapping, MaxBytes, Seed, seconds_of
-from retwin.cli.reading import read, read_all, shown_records
+from retwin.checks import given, one_of, require
+from retwin.cli.options import (
+    CaseArgument,
+    Horizon,
+    Json,
+    LogMapping,
+    MaxBytes,
+    Seed,
+    option,
+    rare,
+    seconds_of,
+)
+from retwin.cli.reading import read, shown_records
 from retwin.cli.terminal import Interrupted, answer, bar, note, table
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.places import check_place
@@ -25,57 +29,45 @@ if TYPE_CHECKING:
     from retwin.evaluation import Choice, Fitted
     from retwin.evaluation.choice.surrogates import StandIn, SurrogateSettings
 
-data_option = partial(typer.Option, metavar="FILE", rich_help_panel="Data")
-model_option = partial(typer.Option, rich_help_panel="Model; by default the case's")
-
-
-def _named(text: str, names: Iterable[str]) -> Any:
-    """An option that names an entry of the catalog."""
-    return model_option(metavar="NAME", help=text, autocompletion=one_of(names))
-
-
-ModelFolder = Annotated[
-    Path, typer.Option(metavar="FOLDER", help="Where to save the updated twin.")
-]
-RealSet = Annotated[list[Path] | None, data_option(help="Real trajectories; may be repeated.")]
-OneFile = Annotated[Path | None, data_option(help="Or one file that the case splits in two.")]
-TwinSet = Annotated[Path | None, data_option(help="Trajectories of the twin; else simulated.")]
-Simulations = Annotated[
-    int | None, data_option(metavar="N", help="Trajectories simulated; else the case's.")
-]
-CalibrateOn = Annotated[str, _named("healthy or all.", catalog.CALIBRATE_ON)]
-Network = Annotated[
-    str | None, _named("Of a surrogate: mlp, lstm, tcn or state_space.", catalog.NETWORKS)
-]
+ModelFolder = Annotated[Path, option("FOLDER", "Where to save the updated twin.")]
+RealSet = Annotated[list[Path], option("FILE", "Real records; may be repeated.")]
+StateEquations = Annotated[bool, option("", "Correct the state equations.", "--dynamics")]
 Correction = Annotated[
-    str | None, _named("additive, delay_offset or command_space.", catalog.CORRECTIONS)
+    str | None,
+    option("NAME", "additive, delay_offset or command_space.", names=catalog.CORRECTIONS),
 ]
-Density = Annotated[
-    str | None, _named("Distribution: mixture, flow or sequence_mixture.", catalog.DENSITIES)
-]
-Refine = Annotated[bool, model_option("--refine", help="Fine-tune on outputs afterwards.")]
-StateEquations = Annotated[bool, model_option("--dynamics", help="Correct the state equations.")]
-SurrogateMode = Annotated[str, _named("auto, on or off.", catalog.SURROGATE_MODES)]
-Compare = Annotated[bool, model_option("--compare/--no-compare", help="Compare candidates.")]
+Compare = Annotated[bool, rare("", "Compare candidates.", "--compare/--no-compare")]
 Yardstick = Annotated[
     bool | None,
-    model_option(
-        "--yardstick/--no-yardstick",
-        help="Compare with models without the twin.",
-    ),
+    rare("", "Compare with models without the twin.", "--yardstick/--no-yardstick"),
 ]
+TwinSet = Annotated[Path | None, rare("FILE", "Trajectories of the twin; else simulated.")]
+Simulations = Annotated[int | None, rare("N", "Trajectories simulated; else the case's.")]
+CalibrateOn = Annotated[str, rare("NAME", "healthy or all.", names=catalog.CALIBRATE_ON)]
+SurrogateMode = Annotated[str, rare("NAME", "auto, on or off.", names=catalog.SURROGATE_MODES)]
+Network = Annotated[
+    str | None,
+    rare("NAME", "Of a surrogate: mlp, lstm, tcn or state_space.", names=catalog.NETWORKS),
+]
+Density = Annotated[
+    str | None,
+    rare("NAME", "mixture, flow or sequence_mixture.", names=catalog.DENSITIES),
+]
+Refine = Annotated[bool, rare("", "Fine-tune on outputs afterwards.", "--refine")]
 
 
 def fit(
     case: CaseArgument,
+    real: RealSet,
     out: ModelFolder,
-    real: RealSet = None,
-    data: OneFile = None,
     horizon: Horizon = "free",
-    compare: Compare = True,
-    yardstick: Yardstick = None,
     dynamics: StateEquations = False,
     correction: Correction = None,
+    mapping: LogMapping = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+    compare: Compare = True,
+    yardstick: Yardstick = None,
     surrogate: SurrogateMode = "auto",
     twin_data: TwinSet = None,
     simulations: Simulations = None,
@@ -83,10 +75,7 @@ def fit(
     network: Network = None,
     density: Density = None,
     refine: Refine = False,
-    seed: Seed = 0,
-    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
-    as_json: Json = False,
 ) -> None:
     """Update a twin by real records; save the updated twin.
 
@@ -100,7 +89,7 @@ def fit(
     holds = ("model.json", "weights.safetensors", "surrogate", "residual", "choice.json")
     check_place(out, folder=True, holds=(*holds, "report.html"))
     seconds = seconds_of("--horizon", horizon)
-    in_catalog("--surrogate", surrogate, catalog.SURROGATE_MODES)
+    one_of("--surrogate", surrogate, catalog.SURROGATE_MODES)
     require(
         not dynamics or (correction is network is twin_data is None and calibrate_on == "healthy"),
         "--dynamics",
@@ -109,7 +98,8 @@ def fit(
         remedy="state equations are corrected alone, by healthy records",
     )
     system = _system(case, network, correction, density, refine, simulations)
-    measured = _labelled(system, _measured(system, real, data, max_bytes, mapping))
+    measured = read(real, system, part="calibration", max_bytes=max_bytes, mapping=mapping)
+    measured = _labelled(system, measured)
     faults = system.faults if calibrate_on == "all" else calibrate_on
     calibrating(measured, faults)  # before a surrogate is trained, which takes minutes
     require(
@@ -252,28 +242,6 @@ def _system(
         remedy="leave it out",
     )
     return replace(system, density=replace(refined, refinement=rt.Refinement()))
-
-
-def _measured(
-    system: Case,
-    real: list[Path] | None,
-    data: Path | None,
-    max_bytes: int | None,
-    mapping: Path | None,
-) -> Trajectories:
-    """The real trajectories to calibrate on."""
-    require(
-        bool(real) != (data is not None),
-        "real data",
-        expected="either --real or --data",
-        got="both" if real else "none",
-        remedy="give --real FILE; or --data FILE, for a case that defines how it is split",
-    )
-    if real:
-        return read_all(real, system, max_bytes=max_bytes, mapping=mapping)
-    assert data is not None
-    expected, got = "a case that defines how its file is split", f"{system.name!r}, which does not"
-    return given("--data", system.records, expected, got=got, remedy="give --real FILE")(data)[0]
 
 
 def _print(found: Fitted, base: StandIn, out: Path, *, as_json: bool) -> None:

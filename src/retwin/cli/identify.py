@@ -11,7 +11,6 @@ from retwin import catalog
 from retwin.checks import existing, one_of, require
 from retwin.cli.completion import complete_twins
 from retwin.cli.options import (
-    TWIN,
     Inputs,
     Json,
     LogMapping,
@@ -21,6 +20,7 @@ from retwin.cli.options import (
     argument,
     channel_names,
     option,
+    rare,
     seconds_of,
 )
 from retwin.cli.reading import shown_records
@@ -38,10 +38,6 @@ if TYPE_CHECKING:
 
 UNRATED = (".fmu", ".xml", ".urdf")
 """Suffixes of twins that take any sample rate."""
-
-
-def _panel(name: str, *described: str, **more: Any) -> Any:
-    return option(*described, rich_help_panel=name, **more)
 
 
 TwinName = Annotated[
@@ -62,26 +58,21 @@ MethodName = Annotated[
     ),
 ]
 HoldOut = Annotated[float | None, option("X", "Share held out; else 0.25.")]
-Loss = Annotated[str | None, _panel("Method", "NAME", "soft_l1 (default), linear or cauchy.")]
-Starts = Annotated[
-    int | None, _panel("Method", "N", "Starts of the search; else 4.", min=1, max=1000)
-]
-SensorRate = Annotated[float | None, _panel("Method", "HZ", "True rate of the sensor, if lower.")]
+Loss = Annotated[str | None, rare("NAME", "soft_l1 (default), linear or cauchy.")]
+Starts = Annotated[int | None, rare("N", "Starts of the search; else 4.", min=1, max=1000)]
+SensorRate = Annotated[float | None, rare("HZ", "True rate of the sensor, if lower.")]
 Horizon = Annotated[
     str,
-    _panel(
-        "Method",
+    rare(
         "SECONDS",
         "Windows to predict, or free.",
     ),
 ]
-Processes = Annotated[int, _panel("Method", "N", "Worker processes.", min=1, max=256)]
-Column = Annotated[
-    list[str] | None, _panel("Logs", "CHANNEL=NAME", "Column of a channel named otherwise.")
-]
-Time = Annotated[str | None, _panel("Logs", "NAME", "Column of the times; NAME=ms, us, ns, iso.")]
-Transient = Annotated[float, _panel("Logs", "SECONDS", "Begin of each log that is not used.")]
-Rate = Annotated[float | None, _panel(TWIN, "HZ", "Samples per second; else the log's.")]
+Processes = Annotated[int, rare("N", "Worker processes.", min=1, max=256)]
+Column = Annotated[list[str] | None, rare("CHANNEL=NAME", "Column of a channel named otherwise.")]
+Time = Annotated[str | None, rare("NAME", "Column of the times; NAME=ms, us, ns, iso.")]
+Transient = Annotated[float, rare("SECONDS", "Begin of each log that is not used.")]
+Rate = Annotated[float | None, option("HZ", "Samples per second; else the log's.")]
 
 
 def identify(
@@ -89,23 +80,23 @@ def identify(
     logs: LogFiles,
     out: Out,
     free: Free = None,
-    method: MethodName = "least_squares",
-    hold_out: HoldOut = None,
-    loss: Loss = None,
-    starts: Starts = None,
-    sensor_rate: SensorRate = None,
-    horizon: Horizon = "",
-    processes: Processes = 1,
-    column: Column = None,
-    time: Time = None,
-    transient: Transient = 0.0,
-    mapping: LogMapping = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
+    mapping: LogMapping = None,
+    method: MethodName = "least_squares",
+    hold_out: HoldOut = None,
     seed: Seed = 0,
-    max_bytes: MaxBytes = None,
     as_json: Json = False,
+    column: Column = None,
+    time: Time = None,
+    transient: Transient = 0.0,
+    horizon: Horizon = "",
+    loss: Loss = None,
+    starts: Starts = None,
+    sensor_rate: SensorRate = None,
+    processes: Processes = 1,
+    max_bytes: MaxBytes = None,
 ) -> None:
     """Identify the parameters of your twin from logs.
 

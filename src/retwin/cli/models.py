@@ -20,11 +20,13 @@ from retwin.cli.options import (
     OtherCase,
     PerClass,
     Seed,
+    argument,
     option,
+    rare,
     seconds_of,
 )
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import read_all, read_commands, system_of, updated_twin
+from retwin.cli.reading import read, read_commands, source_of, system_of, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import Trajectories
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
 
 
 def generate(
-    model: Model,
+    model: Annotated[Path, argument("MODEL", "Folder of a corrected twin, or of a bundle.")],
     out: Annotated[Path, option("FILE", "New *.npz, or *.zarr of any size; *.csv of bands.")],
     commands: Annotated[
         Path | None, option("FILE", "Simulate these commands, in place of drawn ones.")
@@ -69,13 +71,12 @@ def generate(
         _write_bands(model, commands, out, case, seed, mapping)  # type: ignore[arg-type]
         return
     kind = check_target(out)
-    updated = updated_twin(model)
+    updated, system = source_of(model, case)
     if commands is not None:
-        records = read_commands(commands, system_of(updated, model, case), mapping=mapping)
+        records = read_commands(commands, system, mapping=mapping)
         rt.save(updated.simulate(records.commands.astype(float), seed=seed), out)
         note(f"Wrote {len(records)} trajectories to {out}")
         return
-    system = system_of(updated, model, case)
     if kind == ".zarr" or workers is not None:
         n = per_class * len(system.faults)
         plan = rt.deploy.SimulationPlan(updated, system.sampler, seed, n, system.faults)
@@ -95,8 +96,8 @@ def _write_bands(
     """Mean and quantiles of every sample of given commands, as a table."""
     from retwin.evaluation import predict_records
 
-    updated = updated_twin(model)
-    records = read_commands(commands, system_of(updated, model, case), mapping=mapping)
+    updated, system = source_of(model, case)
+    records = read_commands(commands, system, mapping=mapping)
     write_predictions(predict_records(updated, records, seed=seed), records, out)
     note(f"Wrote mean and 90 % bands of {len(records)} records to {out}")
 
@@ -123,7 +124,7 @@ def evaluate(
     model: Model,
     real: Annotated[list[Path], option("FILE", "Records it was not fitted to; may be repeated.")],
     horizon: Horizon = "free",
-    warm_up: Annotated[str, option("TIME", "Begin of each record that is not scored, as 5s.")] = "",
+    warm_up: Annotated[str, rare("TIME", "Begin of each record that is not scored, as 5s.")] = "",
     out: Annotated[Path | None, option("FILE", "CSV file of predictions with bands.")] = None,
     case: OtherCase = None,
     seed: Seed = 0,
@@ -140,7 +141,7 @@ def evaluate(
         check_place(out)
     updated = updated_twin(model)
     system = system_of(updated, model, case)
-    records = read_all(real, system, max_bytes=max_bytes, mapping=mapping)
+    records = read(real, system, part="test", max_bytes=max_bytes, mapping=mapping)
     scores = score_model(
         updated, records, horizon=ahead, warm_up=skipped, twin=system.twin, seed=seed
     )

@@ -14,30 +14,39 @@ from dataclasses import replace
 from functools import partial
 from math import isnan
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from retwin import catalog
 from retwin.checks import at_least, finite, positive, require
 from retwin.cli.commands import Commands
-from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase, argument, option
+from retwin.cli.options import (
+    Json,
+    LogMapping,
+    MaxBytes,
+    OtherCase,
+    argument,
+    leave_out,
+    option,
+    rare,
+)
 from retwin.cli.reading import case_named, read, read_signals, saved, shown_records
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.quality.check import check_records
-from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
+    from retwin.cases.twin_data import TwinData
     from retwin.monitor import Alarm, Cause, Monitor, Watched
     from retwin.update import DynamicsTwin
 
 EVENT = ("file", "record", "from s", "to s", "what", "cause")
 """What is shown of an event."""
+CONFIG = Path("monitor.toml")
 Reading = Callable[..., Trajectories]
 """`cli.reading.read` with the options of the command."""
 
@@ -79,13 +88,7 @@ def fit(
     healthy = files[1:] if model else files
     at_least("FILE", healthy, 1, "file", remedy="name healthy records after the model")
     if model and kind_of(saved(model)) in catalog.DIAGNOSERS:
-        require(
-            lasting is None,
-            "lasting",
-            expected="none for a diagnoser, whose monitor watches whole trajectories",
-            got=lasting,
-            remedy="leave it out",
-        )
+        leave_out({"--lasting": lasting}, "for a diagnoser, which watches whole trajectories")
         _fit_trajectories(model, healthy, out, false_alarms, case, reading, as_json)
         return
     known = DynamicsTwin.load(model) if model else None
@@ -94,7 +97,7 @@ def fit(
         records = [read_signals(healthy, max_bytes)]
     else:
         records = [
-            _healthy(reading(file, system or _named(known, file, mapping)), file)
+            _healthy(reading(file, system or _named(known), part="calibration"), file)
             for file in healthy
         ]
     with bar("calibrate") as show:
@@ -148,7 +151,7 @@ def replay(
     system = case_named(case or made.twin.case or None)
     found, rows = [], []
     for file in logs:
-        record = reading(file, system or _named(made.twin, file, mapping))
+        record = reading(file, system or _named(made.twin))
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
         found.append((file, record, watched, causes))
@@ -237,57 +240,31 @@ def _replay_trajectories(
     )
 
 
-@app.command(epilog=example("retwin monitor demo --open"))
-def demo(
-    port: Annotated[int, option("N", "Of the page; 0 is any free one.", min=0, max=65535)] = 8710,
-    seconds: Annotated[float | None, option("S", "End by itself after this time.")] = None,
-    open_page: Annotated[bool, option("", "Open the page in a browser.", "--open")] = False,
-    as_json: Json = False,
-) -> None:
-    """Show the live monitor with emulated incubators, of which some become faulty.
-
-    They run 60 times as fast as real ones. Everything is removed at the end.
-    """
-    from retwin.monitor.demo import announced, demonstration
-    from retwin.monitor.server import create_app, listening, serving
-
-    if seconds is not None:
-        finite("seconds", positive("seconds", seconds, unit="s"), most=threading.TIMEOUT_MAX)
-    token = secrets.token_urlsafe()
-    for line in announced():
-        note(line)
-    with (
-        listening("127.0.0.1", port) as bound,
-        tempfile.TemporaryDirectory(prefix="retwin-") as folder,
-        ExitStack() as running,
-    ):
-        with bar("demo") as show:
-            show("fit the twin", 0.0)
-            live, gate, explanations = running.enter_context(demonstration(Path(folder)))
-        app = create_app(live, gate, token=token, explanations=explanations, emulated=True)
-        running.enter_context(serving(app, bound))
-        address = f"http://127.0.0.1:{bound.getsockname()[1]}/"
-        answer(
-            {"address": address, "token": token},
-            f"Page: {address}",
-            f"Token, for changes on the page: {token}",
-            as_json=as_json,
-        )
-        note(f"It ends {'' if seconds is None else f'after {seconds:g} s, or '}with Ctrl-C.")
-        if open_page:
-            webbrowser.open(address)
-        with suppress(KeyboardInterrupt):
-            threading.Event().wait(seconds)
-    note("The demonstration has ended; nothing of it is kept.")
-
-
 @app.command(epilog=example("retwin monitor run --config monitor.toml"))
 def run(
-    config: Annotated[Path, option("FILE", "Machines, twins and sources, as TOML.")] = Path(
-        "monitor.toml"
-    ),
+    config: Annotated[Path, option("FILE", "Machines, twins and sources.")] = CONFIG,
+    demo: Annotated[
+        bool, option("", "Watch emulated incubators, of which some become faulty.", "--demo")
+    ] = False,
+    port: Annotated[
+        int | None, option("N", "Of the demo's page; else 8710; 0: any.", min=0, max=65535)
+    ] = None,
+    open_page: Annotated[bool, option("", "Open the demo's page in a browser.", "--open")] = False,
+    seconds: Annotated[float | None, option("S", "End the demo after this time.")] = None,
 ) -> None:
-    """Watch running machines, until Ctrl-C or SIGTERM."""
+    """Watch running machines, until Ctrl-C or SIGTERM.
+
+    The incubators of --demo run 60 times as fast as real ones; nothing of them is
+    kept.
+    """
+    if seconds is not None:
+        finite("seconds", positive("seconds", seconds, unit="s"), most=threading.TIMEOUT_MAX)
+    if demo:
+        leave_out({"--config": None if config == CONFIG else config}, "with --demo")
+        _demonstrate(8710 if port is None else port, open_page, seconds)
+        return
+    others = {"--port": port, "--open": open_page, "--seconds": seconds}
+    leave_out(others, "without --demo")
     from retwin.monitor.program import run as watch
     from retwin.monitor.settings import read_settings
 
@@ -302,11 +279,39 @@ def run(
     note("Stopped; everything that was acknowledged is stored.")
 
 
+def _demonstrate(port: int, open_page: bool, seconds: float | None) -> None:
+    """Show the live monitor with emulated machines, for so long or until Ctrl-C."""
+    from retwin.monitor.demo import announced, demonstration
+    from retwin.monitor.server import create_app, listening, serving
+
+    token = secrets.token_urlsafe()
+    for line in announced():
+        note(line)
+    with (
+        listening("127.0.0.1", port) as bound,
+        tempfile.TemporaryDirectory(prefix="retwin-") as folder,
+        ExitStack() as running,
+    ):
+        with bar("demo") as show:
+            show("fit the twin", 0.0)
+            live, gate, explanations = running.enter_context(demonstration(Path(folder)))
+        app = create_app(live, gate, token=token, explanations=explanations, emulated=True)
+        running.enter_context(serving(app, bound))
+        address = f"http://127.0.0.1:{bound.getsockname()[1]}/"
+        answer(None, f"Page: {address}", f"Token, for changes on the page: {token}")
+        note(f"It ends {'' if seconds is None else f'after {seconds:g} s, or '}with Ctrl-C.")
+        if open_page:
+            webbrowser.open(address)
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait(seconds)
+    note("The demonstration has ended; nothing of it is kept.")
+
+
 @app.command(epilog=example("retwin monitor audit store"))
 def audit(
     store: Annotated[Path, argument("STORE", "Folder of the store, or an exported log.")],
-    head: Annotated[str | None, option("HASH", "A former head that was kept elsewhere.")] = None,
-    url: Annotated[str, option("URL", "The PostgreSQL database, if one.")] = "",
+    head: Annotated[str | None, rare("HASH", "A former head that was kept elsewhere.")] = None,
+    url: Annotated[str, rare("URL", "The PostgreSQL database, if one.")] = "",
     as_json: Json = False,
 ) -> None:
     """Verify the log of a store, and the files of its versions."""
@@ -346,7 +351,7 @@ def recalibrate(
     new_normal: Annotated[
         bool, option("", "A change that lasts is no fault but the new normal.", "--new-normal")
     ] = False,
-    url: Annotated[str, option("URL", "The PostgreSQL database, if one.")] = "",
+    url: Annotated[str, rare("URL", "The PostgreSQL database, if one.")] = "",
     as_json: Json = False,
 ) -> None:
     """Propose a monitor of the last quiet hours, in the shadow of the active one."""
@@ -364,10 +369,11 @@ def _tables(files: Sequence[Path]) -> bool:
     return all(each.suffix.lower() == ".csv" for each in files)
 
 
-def _named(twin: DynamicsTwin | None, file: Path, mapping: Path | None) -> Any:
+def _named(twin: DynamicsTwin | None) -> TwinData | None:
     """What `read` takes for a case: the twin by whose channels the columns of a table are named."""
-    wanted = twin is not None and mapping is None and _tables([file])
-    return SimpleNamespace(twin=twin) if wanted else None
+    from retwin.cases.twin_data import TwinData
+
+    return twin and TwinData(twin.inputs, twin.outputs, twin.rate, twin=twin)
 
 
 def _healthy(record: Trajectories, file: Path) -> Trajectories:
@@ -412,13 +418,12 @@ def _event_rows(
     ends = {(each.trajectory, each.event): each for each in watched.endings}
     rows = []
     for first in watched.events:
-        names, before = [], -np.inf
-        for i, alarm in enumerate(watched.alarms):
-            if (alarm.trajectory, alarm.event) == (first.trajectory, first.event):
-                # A further one is of a second fault if that began after the alarm before.
-                if alarm.opens or (causes[i].name != HEALTHY and causes[i].onset[1] > before):
-                    names.append(_written(causes[i]))
-                before = alarm.time
+        names = [
+            _written(cause)
+            for cause in causes
+            if (cause.alarm.trajectory, cause.alarm.event) == (first.trajectory, first.event)
+            and not cause.same
+        ]
         end = ends.get((first.trajectory, first.event))
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"

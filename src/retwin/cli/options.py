@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from retwin.catalog import CASES
-from retwin.checks import positive, whole
+from retwin.checks import positive, require, whole
 from retwin.cli.completion import one_of
 
 
@@ -38,6 +38,12 @@ def option(
     return typer.Option(*flags, metavar=metavar or None, help=text, **more)
 
 
+RARE = "Rarely needed"
+"""The panel of help with the options that few users need."""
+rare = partial(option, rich_help_panel=RARE)
+"""An option in that panel; see `option`."""
+
+
 def argument(metavar: str, text: str, *, names: Iterable[str] | None = None, **more: Any) -> Any:
     """An argument of a command; see `option`."""
     if names is not None:
@@ -50,7 +56,9 @@ case_option = partial(typer.Option, "--case", metavar="CASE", autocompletion=one
 
 CaseArgument = Annotated[str, argument("CASE", CASE, names=CASES)]
 CaseOption = Annotated[str | None, case_option(help=CASE)]
-OtherCase = Annotated[str | None, case_option(help="If another than it was fitted for.")]
+OtherCase = Annotated[
+    str | None, case_option(help="If another than it was fitted for.", rich_help_panel=RARE)
+]
 Model = Annotated[Path, argument("MODEL", "Folder of a corrected twin.")]
 Real = Annotated[Path, argument("REAL", "The trajectories it was calibrated on.")]
 Measured = Annotated[Path, argument("FILE", "Trajectories; labels are not needed.")]
@@ -58,15 +66,9 @@ Probabilities = Annotated[Path | None, option("FILE", "CSV file for all probabil
 PerClass = Annotated[int, option("N", "Trajectories per class.")]
 Rate = Annotated[float | None, option("HZ", "Samples per second, if the file has none.", "--rate")]
 LogMapping = Annotated[Path | None, option("FILE", "What `retwin data map` wrote.", "--mapping")]
-TWIN = "Twin"
-"""The panel of help with the options of a twin that is no case."""
-Inputs = Annotated[
-    str, option("NAMES", "Of the inputs, joined by commas.", "--inputs", rich_help_panel=TWIN)
-]
-Outputs = Annotated[
-    str, option("NAMES", "Of the outputs, joined by commas.", "--outputs", rich_help_panel=TWIN)
-]
-MaxBytes = Annotated[int | None, option("N", "Limit of a file; else by what is free.", min=1)]
+Inputs = Annotated[str, option("NAMES", "Of a function's inputs, joined by commas.", "--inputs")]
+Outputs = Annotated[str, option("NAMES", "Of its outputs, joined by commas.", "--outputs")]
+MaxBytes = Annotated[int | None, rare("N", "Limit of a file; else what is free.", min=1)]
 MAX_SEED = 2**63 - 1
 """The largest seed that every generator of random numbers takes."""
 Seed = Annotated[
@@ -84,6 +86,13 @@ Json = Annotated[bool, option("", "Print JSON instead, and nothing else.", "--js
 Horizon = Annotated[
     str, option("TIME", "Judge by predictions so far ahead: 1s, free.", "--horizon")
 ]
+
+
+def leave_out(options: Mapping[str, object], when: str) -> None:
+    """Refuse options that have no meaning `when`; None and False are those that were not given."""
+    for name, value in options.items():
+        absent = value is None or value is False
+        require(absent, name, expected=f"none {when}", got=value, remedy="leave it out")
 
 
 def seconds_of(option: str, text: str) -> float | None:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from retwin.cli.options import option
+from retwin.cli.options import rare
 from retwin.cli.terminal import FAILED, bar, complain, note, resumable
 
 if TYPE_CHECKING:
     from retwin.deploy.simulations import SimulationPlan
 
-Workers = Annotated[int | None, option("N", "Processes for *.zarr; else one per core.", min=1)]
-Scheduler = Annotated[str | None, option("ADDRESS", "Dask scheduler, in place of processes.")]
+Workers = Annotated[int | None, rare("N", "Processes for *.zarr; else all cores.", min=1)]
+Scheduler = Annotated[str | None, rare("ADDRESS", "Dask scheduler instead of processes.")]
 
 
 def carry_out(

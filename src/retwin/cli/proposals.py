@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from retwin.cli.options import CaseArgument, Json, LogMapping, Model, Seed, option
+from retwin.cli.options import CaseArgument, Json, LogMapping, Model, Seed, option, rare
 from retwin.cli.reading import case_named, read, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
@@ -20,8 +20,8 @@ def propose(
     real: Annotated[Path, option("FILE", "The trajectories it was calibrated on.")],
     out: Annotated[Path, option("FILE", "The commands to send, *.npz.")],
     count: Annotated[int, option("N", "Trajectories to propose.")] = 3,
-    candidates: Annotated[int, option("N", "Commands to choose from.")] = 200,
-    tolerance: Annotated[float, option("X", "Share by which bands may be too wide.")] = 0.05,
+    candidates: Annotated[int, rare("N", "Commands to choose from.")] = 200,
+    tolerance: Annotated[float, rare("X", "Share by which bands may be too wide.")] = 0.05,
     seed: Seed = 0,
     mapping: LogMapping = None,
     as_json: Json = False,
@@ -35,7 +35,7 @@ def propose(
     system = case_named(case)
     assert system is not None
     twin = updated_twin(model)
-    calibration = read(real, system, mapping=mapping)
+    calibration = read(real, system, part="calibration", mapping=mapping)
     with bar("next") as show:
         made = rt.next_experiments(
             twin,

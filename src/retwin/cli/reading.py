@@ -6,21 +6,28 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from retwin.checks import existing, given
 from retwin.cli.terminal import bar, note, table
 from retwin.data.io import DataCase, load
+from retwin.data.logs.reading import is_log
 from retwin.data.trajectories import Trajectories
+from retwin.serialisation.models import kind_of
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from retwin.cases.case import Case
     from retwin.data.quality.check import Checked
+    from retwin.deploy.bundle.bundle import Bundle
+    from retwin.deploy.onnx.portable import Portable
     from retwin.update import CorrectedTwin, DynamicsTwin
+
+Part = Literal["all", "calibration", "test"]
+"""Which of the records that a case states of a table."""
 
 
 def case_named(name: str | None) -> Case | None:
@@ -62,26 +69,104 @@ def updated_twin(folder: Path) -> CorrectedTwin | DynamicsTwin:
     return load_twin(saved(folder))
 
 
+def is_sealed(folder: Path) -> bool:
+    """Whether the folder is a bundle, or the ONNX export of one."""
+    from retwin.deploy.bundle.seal import SCHEMAS, SUMS
+
+    return kind_of(folder) in SCHEMAS or (folder / SUMS).exists()
+
+
+def open_sealed(folder: Path) -> Bundle | Portable:
+    """The bundle, or its export, for which torch is not imported."""
+    from retwin.deploy.bundle.seal import read_sealed
+
+    if read_sealed(folder, "bundle", "portable")["kind"] == "portable":
+        from retwin.deploy.onnx.portable import Portable
+
+        return Portable.load(folder)
+    from retwin.deploy.bundle.bundle import Bundle
+
+    return Bundle.load(folder)
+
+
+def source_of(folder: Path, name: str | None) -> tuple[CorrectedTwin | DynamicsTwin, Case]:
+    """The updated twin of a saved model or bundle, and its case or the one of that name."""
+    if not is_sealed(saved(folder)):
+        updated = updated_twin(folder)
+        return updated, system_of(updated, folder, name)
+    from retwin import cases
+    from retwin.deploy.bundle.bundle import Bundle
+
+    bundle = Bundle.load(folder)
+    # Only built-in names: code that a file names is not run, so other cases are given by --case.
+    if name is None and bundle.facts.sampler is None and bundle.facts.case.isidentifier():
+        name = bundle.facts.case
+    return bundle.twin, bundle.case if name is None else cases.get(name)
+
+
 def read(
-    file: Path,
-    case: DataCase | None = None,
+    files: Path | Sequence[Path],
+    case: DataCase | str | None = None,
     rate: float | None = None,
     *,
+    part: Part = "all",
     max_bytes: int | None = None,
     mapping: Path | None = None,
 ) -> Trajectories:
-    """The trajectories of a file, with a bar while they are read; of a log by its mapping.
+    """The trajectories of files together, with a bar while they are read.
 
-    The columns of a table without a mapping have the names of the channels of the case's twin.
+    The one way from files to trajectories. Logs are read by their mapping, else by what the case
+    states of its records, else by columns with the names of the channels of its twin.
+
+    Parameters
+    ----------
+    files : path or sequence of path
+        Files or folders.
+    case : DataCase or str, optional
+        The case, or anything with its `twin`, or its name.
+    rate : float, optional
+        Sample rate in Hz, if a file has none.
+    part : {"all", "calibration", "test"}
+        Of tables that the case divides into records of calibration and test.
+    max_bytes, mapping
+        See `rt.load`.
+
     """
-    twin = getattr(case, "twin", None)
-    if mapping is None and twin is not None and file.suffix.lower() == ".csv" and file.is_file():
+    if isinstance(files, Path):
+        return _read(files, case, rate, part, max_bytes, mapping)
+    sets = [_read(file, case, rate, part, max_bytes, mapping) for file in files]
+    return sets[0] if len(sets) == 1 else Trajectories.concatenate(sets)
+
+
+def _read(
+    file: Path,
+    case: DataCase | str | None,
+    rate: float | None,
+    part: Part,
+    max_bytes: int | None,
+    mapping: Path | None,
+) -> Trajectories:
+    log = mapping is None and file.exists() and (is_log(file) or file.is_dir())
+    if isinstance(case, str):  # a built-in case without torch has no twin to read logs by
+        case = case_named(case) if log and not file.is_dir() else data_case(case)
+    divided = log and getattr(case, "records", None) is not None
+    twin: Any = getattr(case, "twin", None)
+    if divided or (log and is_log(file) and twin is not None):
         from retwin.cases import LogReader
 
-        found = LogReader(max_bytes=max_bytes).trajectories([file], twin)
+        reader = LogReader(max_bytes=max_bytes)
+        if divided and is_log(file):  # one with the names of the channels is read by these
+            divided = not set(twin.inputs.names) <= set(reader.signals(file)) or not (
+                reader.measured_outputs([file], twin)
+            )
+        own = case if divided else None
+        found = reader.trajectories([file], twin, case=own)
         for text in found.notes:
             note(text)
-        return found.trajectories
+        if found.test is None or part == "calibration":
+            return found.trajectories
+        both = [found.trajectories, found.test]
+        return found.test if part == "test" else Trajectories.concatenate(both)
     with bar("read") as show:
         return load(
             file,
@@ -118,29 +203,19 @@ def read_signals(files: Sequence[Path], max_bytes: int | None = None) -> Traject
         names = tuple(name for name in names if name not in fixed)
 
 
-def read_all(
-    files: Sequence[Path],
-    case: DataCase | None = None,
-    *,
-    max_bytes: int | None = None,
-    mapping: Path | None = None,
-) -> Trajectories:
-    """The trajectories of all files together."""
-    sets = [read(file, case, max_bytes=max_bytes, mapping=mapping) for file in files]
-    return sets[0] if len(sets) == 1 else Trajectories.concatenate(sets)
-
-
 def read_commands(file: Path, case: Case, *, mapping: Path | None = None) -> Trajectories:
     """The same to be simulated: a table may hold the commands alone."""
     from retwin.cases import LogReader
     from retwin.twins import FunctionTwin
 
-    twin, table = case.twin, mapping is None and file.suffix.lower() == ".csv" and file.is_file()
+    twin, table = case.twin, mapping is None and file.is_file() and is_log(file)
     if not table or LogReader().measured_outputs([file], twin):
         return read(file, case, mapping=mapping)
     # A twin whose outputs are its commands, so that no output is missing.
     alone = FunctionTwin(lambda u: u, rate=twin.rate, inputs=twin.inputs, outputs=twin.inputs)
     found = read(file, replace(case, twin=alone))
+    if found.outputs == twin.outputs:  # the records that the case states of the table
+        return found
     nothing = np.zeros((*found.commands.shape[:2], len(twin.outputs)))
     unseen = np.zeros(nothing.shape, dtype=bool)
     outputs = {"outputs": twin.outputs, "nominal": nothing, "observed": nothing, "mask": unseen}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +13,7 @@ from rich.table import Table
 from retwin import catalog
 from retwin.checks import given
 from retwin.cli.completion import complete_sources
-from retwin.cli.options import CaseArgument, Json, LogMapping, Seed, argument, option
+from retwin.cli.options import CaseArgument, Json, LogMapping, Seed, argument, option, rare
 from retwin.cli.plans import Scheduler
 from retwin.cli.terminal import answer, bar, command_given, note, plain, resumable, table
 from retwin.progress import FinishedStage
@@ -32,24 +31,16 @@ DEMO_MINUTES = 4
 """Minutes that a run of the demo takes at most on two cores, as measured."""
 COMPARED = {"a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict"}
 """What is printed of a comparison as JSON."""
-data_option, compared_option = (
-    partial(option, rich_help_panel=panel)
-    for panel in (
-        "Data: either --real, or --calibration and --test, or --data",
-        "What is compared",
-    )
-)
-
 StudyFolder = Annotated[Path, option("FOLDER", "Called again, the study goes on there.")]
-RealSet = Annotated[Path | None, data_option("FILE", "One real set, split into folds.")]
-Folds = Annotated[int, data_option("N", "Folds of --real.")]
-CalibrationSet = Annotated[Path | None, data_option("FILE", "Real set to calibrate on.")]
-TestSet = Annotated[Path | None, data_option("FILE", "Real set to test on.")]
-OneFile = Annotated[Path | None, data_option("FILE", "One file that the case splits itself.")]
-TwinSet = Annotated[Path | None, data_option("FILE", "Trajectories of the twin; else simulated.")]
+RealSet = Annotated[Path | None, option("FILE", "One real set, split into --folds.")]
+Folds = Annotated[int, option("N", "Folds of --real.")]
+CalibrationSet = Annotated[Path | None, option("FILE", "Or one to calibrate on, and --test.")]
+TestSet = Annotated[Path | None, option("FILE", "One to test on.")]
+OneFile = Annotated[Path | None, option("FILE", "Or one file that the case splits.")]
+TwinSet = Annotated[Path | None, option("FILE", "Trajectories of the twin; else simulated.")]
 Sources = Annotated[
     str | None,
-    compared_option(
+    option(
         "NAMES",
         "Joined by commas, or all; else dt (or twin), ibg, ibg_rg.",
         autocompletion=complete_sources,
@@ -57,24 +48,22 @@ Sources = Annotated[
 ]
 Preset = Annotated[
     str,
-    compared_option("NAME", "quick or paper: classifier, training, runs.", names=catalog.PRESETS),
+    option("NAME", "quick or paper: classifier, training, runs.", names=catalog.PRESETS),
 ]
 Classifier = Annotated[
     str | None,
-    compared_option("NAME", "cnn, lstm or rocket; else the preset's.", names=catalog.CLASSIFIERS),
+    rare("NAME", "cnn, lstm or rocket; else the preset's.", names=catalog.CLASSIFIERS),
 ]
-Runs = Annotated[int | None, compared_option("N", "Runs; else the preset's.")]
-Rate = Annotated[float | None, compared_option("HZ", "Rate of the features; else the sensor's.")]
-PerClass = Annotated[int | None, compared_option("N", "Generated trajectories; else the case's.")]
-CalibrateOn = Annotated[str, compared_option("NAME", "healthy or all.", names=catalog.CALIBRATE_ON)]
-RandomOnset = Annotated[
-    bool, compared_option("", "Draw the onset of stuck motors.", "--random-onset")
-]
-EncoderNoise = Annotated[float, compared_option("X", "Noise on frozen joints, in command units.")]
+Runs = Annotated[int | None, option("N", "Runs; else the preset's.")]
+Rate = Annotated[float | None, rare("HZ", "Rate of the features; else the sensor's.")]
+PerClass = Annotated[int | None, option("N", "Generated trajectories; else the case's.")]
+CalibrateOn = Annotated[str, rare("NAME", "healthy or all.", names=catalog.CALIBRATE_ON)]
+RandomOnset = Annotated[bool, rare("", "Draw the onset of stuck motors.", "--random-onset")]
+EncoderNoise = Annotated[float, rare("X", "Noise on frozen joints, in command units.")]
 LearningCurve = Annotated[
-    bool, compared_option("", "Also calibrate on 1, 2, 4, 6 … healthy ones.", "--learning-curve")
+    bool, rare("", "Also calibrate on 1, 2, 4, 6 … healthy ones.", "--learning-curve")
 ]
-Processes = Annotated[int | None, option("N", "Jobs at a time; else one per core.")]
+Processes = Annotated[int | None, rare("N", "Jobs at a time; else one per core.")]
 
 
 def study(
@@ -86,21 +75,21 @@ def study(
     test: TestSet = None,
     data: OneFile = None,
     twin_data: TwinSet = None,
+    mapping: LogMapping = None,
     sources: Sources = None,
     preset: Preset = "quick",
-    classifier: Classifier = None,
     runs: Runs = None,
-    rate: Rate = None,
     per_class: PerClass = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+    classifier: Classifier = None,
+    rate: Rate = None,
     calibrate_on: CalibrateOn = "healthy",
     random_onset: RandomOnset = False,
     encoder_noise: EncoderNoise = 0.0,
     learning_curve: LearningCurve = False,
-    seed: Seed = 0,
     processes: Processes = None,
     scheduler: Scheduler = None,
-    mapping: LogMapping = None,
-    as_json: Json = False,
 ) -> None:
     """Compare updated twins with other sources on real trajectories."""
     import retwin as rt

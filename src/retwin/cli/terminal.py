@@ -25,6 +25,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgres
 from rich.table import Table
 from rich.text import Text
 
+from retwin.checks import install_command
 from retwin.errors import place_of
 from retwin.progress import FinishedStage, ResumedStage
 
@@ -279,7 +280,9 @@ def complain_of_interruption(kept: str = "") -> None:
 
 def described(error: Exception) -> str:
     """Type and message of an exception, and the line of the user's code that raised it."""
-    at = "; ".join(getattr(error, "__notes__", ())) or place_of(error)
+    at = "; ".join(dict.fromkeys(getattr(error, "__notes__", ()))) or place_of(error)
+    if isinstance(error, ModuleNotFoundError) and not at:
+        at = f"install what retwin needs: {install_command()}"
     if not (at or isinstance(error, OSError | RuntimeError)):
         at = "RETWIN_TRACEBACK=1 in the environment shows where"
     return f"{type(error).__name__}: {error}" + (f" ({at})" if at else "")
@@ -326,10 +329,14 @@ def interrupted_by_term() -> Iterator[None]:
 
 @contextmanager
 def show_warnings() -> Iterator[None]:
-    """Print each warning as one line on stderr, without its source line."""
+    """Print each warning as one line on stderr, once and without its source line."""
+    shown: set[str] = set()
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
-        _mark("warning", "yellow", str(message))
+        # Python's own record of what was shown is lost with every `catch_warnings`.
+        if str(message) not in shown:
+            shown.add(str(message))
+            _mark("warning", "yellow", str(message))
 
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)

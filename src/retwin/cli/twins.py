@@ -1,4 +1,4 @@
-"""`retwin twin`: list, describe, simulate and film twins."""
+"""`retwin twin`: list, describe and simulate twins, and film what they do."""
 
 from __future__ import annotations
 
@@ -9,10 +9,29 @@ from typing import TYPE_CHECKING, Annotated, Any
 from retwin import twins
 from retwin.catalog import CASES, TWINS
 from retwin.checks import agree, given, require
-from retwin.cli.animate import animate
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_faults, complete_twins
-from retwin.cli.options import Json, MaxBytes, Seed, argument, channel_names, option
+from retwin.cli.films import (
+    Film,
+    FilmedId,
+    FilmSize,
+    FramesPerSecond,
+    Renderer,
+    draw_film,
+    film_settings,
+)
+from retwin.cli.options import (
+    Inputs,
+    Json,
+    MaxBytes,
+    Outputs,
+    Seed,
+    argument,
+    channel_names,
+    leave_out,
+    option,
+    rare,
+)
 from retwin.cli.plans import Scheduler, Workers, carry_out
 from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, example, table
@@ -37,28 +56,26 @@ app = Commands(
 TwinName = Annotated[
     str,
     argument(
-        "TWIN", "See `retwin twin list`; or a saved model's folder.", autocompletion=complete_twins
+        "TWIN", "See `retwin twin info`; or a saved model's folder.", autocompletion=complete_twins
     ),
 ]
-Inputs = Annotated[str, option("NAMES", "Of the inputs, joined by commas.")]
-Outputs = Annotated[str, option("NAMES", "Of the outputs, joined by commas.")]
-Rate = Annotated[float | None, option("HZ", "Samples per second.", min=1e-9)]
+Rate = Annotated[float | None, rare("HZ", "Samples per second.", min=1e-9)]
 
 RAMPS = 5
 """Ramps in a trajectory whose commands no case draws: enough to reach levels far apart."""
-NoMeshes = Annotated[bool, option("", "Leave out the meshes of a model file.", "--no-meshes")]
+NoMeshes = Annotated[bool, rare("", "Leave out the meshes of a model file.", "--no-meshes")]
 Servos = Annotated[
-    list[str] | None, option("JOINT=K,D", "A servo for a joint of a URDF; repeatable.", "--servo")
+    list[str] | None, rare("JOINT=K,D", "Servo of a URDF's joint; repeatable.", "--servo")
 ]
-Count = Annotated[int | None, option("N", "Else one per row of --commands, or class.", "--n")]
+Count = Annotated[int | None, option("N", "Else one per command or class.", "--n")]
 CommandCase = Annotated[
-    str | None, option("CASE", "Source of commands and faults; else its own.", names=CASES)
+    str | None, option("CASE", "Draws commands and faults; else its own.", names=CASES)
 ]
 CommandFile = Annotated[Path | None, option("FILE", "Trajectories with the commands.")]
 FaultName = Annotated[
-    str, option("NAME", "A class, or all (dealt in turn), or none.", autocompletion=complete_faults)
+    str, option("NAME", "A class, all (in turn), or none.", autocompletion=complete_faults)
 ]
-Duration = Annotated[float | None, option("SECONDS", "Of commands that no case draws.", min=1e-9)]
+Duration = Annotated[float | None, rare("SECONDS", "Of commands that no case draws.", min=1e-9)]
 
 SHOWN = 100
 """Largest number of channels in a table: one of thousands takes minutes to lay out."""
@@ -71,25 +88,12 @@ OTHERS = {
 }
 
 
-@app.command("list", epilog=example("retwin twin list"))
-def list_twins(as_json: Json = False) -> None:
-    """List the built-in twins, and the forms of other names."""
-    built_in = {name: entry.title for name, entry in TWINS.items()}
-    answer(
-        {
-            "built_in": [{"name": name, "title": title} for name, title in built_in.items()],
-            "forms": [{"form": form, "title": title} for form, title in OTHERS.items()],
-        },
-        table(("TWIN", "is"), built_in.items()),
-        "",
-        table(("or", "is"), OTHERS.items()),
-        as_json=as_json,
-    )
-
-
 @app.command(epilog=example("retwin twin info armpi"))
 def info(
-    twin: TwinName,
+    twin: Annotated[
+        str | None,
+        argument("TWIN", "Else all are listed.", autocompletion=complete_twins),
+    ] = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
@@ -99,9 +103,13 @@ def info(
 ) -> None:
     """Describe a twin: its inputs with their limits, its outputs, its rate.
 
-    A module that is named by the twin or its case, and lies beside the case or in the current
-    folder, is run with your rights.
+    Without a name, the built-in twins and the forms of other names are listed. A
+    module that is named by the twin or its case, and lies beside the case or in
+    the current folder, is run with your rights.
     """
+    if twin is None:
+        _list(as_json)
+        return
     found = _twin(twin, inputs, outputs, rate, servo, no_meshes)
     facts: dict[str, Any] = {
         "title": _title(twin, found),
@@ -127,6 +135,21 @@ def info(
     )
 
 
+def _list(as_json: bool) -> None:
+    """The built-in twins, and the forms of other names."""
+    built_in = {name: entry.title for name, entry in TWINS.items()}
+    answer(
+        {
+            "built_in": [{"name": name, "title": title} for name, title in built_in.items()],
+            "forms": [{"form": form, "title": title} for form, title in OTHERS.items()],
+        },
+        table(("TWIN", "is"), built_in.items()),
+        "",
+        table(("or", "is"), OTHERS.items()),
+        as_json=as_json,
+    )
+
+
 def _channels(channels: Channels, limits: Limits | None) -> list[dict[str, Any]]:
     ends: list[tuple[float | None, float | None]] = [(None, None)] * len(channels)
     if limits is not None:
@@ -145,50 +168,59 @@ def _ends(channel: dict[str, Any]) -> tuple[str, str]:
 @app.command(epilog=example("retwin twin simulate armpi --n 20000 --fault all --out made.zarr"))
 def simulate(
     twin: TwinName,
-    out: Annotated[Path, option("FILE", "New *.npz, or *.zarr of any size.")],
+    out: Annotated[Path | None, option("FILE", "New *.npz, or *.zarr of any size.")] = None,
     n: Count = None,
     case: CommandCase = None,
     commands: CommandFile = None,
     fault: FaultName = "none",
+    seed: Seed = 0,
+    film: Film = None,
+    name: FilmedId = None,
+    fps: FramesPerSecond = None,
+    size: FilmSize = None,
+    renderer: Renderer = None,
     duration: Duration = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
     servo: Servos = None,
     no_meshes: NoMeshes = False,
-    seed: Seed = 0,
-    clip: Annotated[bool, option("", "Clip commands to the limits.", "--clip")] = False,
+    clip: Annotated[bool, rare("", "Clip commands to the limits.", "--clip")] = False,
     workers: Workers = None,
     scheduler: Scheduler = None,
-    chunk: Annotated[int, option("N", "Trajectories per chunk.", min=1)] = 256,
+    chunk: Annotated[int, rare("N", "Trajectories per chunk.", min=1)] = 256,
     max_bytes: MaxBytes = None,
 ) -> None:
-    """Simulate trajectories to a file; an interrupted *.zarr is resumed."""
+    """Simulate trajectories to a file, or film one.
+
+    An interrupted *.zarr is resumed. A film shows the nominal motion as a ghost,
+    the observed one solid, and the bands of TWIN if it is a corrected one.
+    """
     from retwin.deploy.simulations import SimulationPlan
 
-    check_target(out)
+    filmed = commands if out is None else out
+    expected, remedy = "a file to write, or trajectories to film", "give --out FILE"
+    require(out or (film and filmed), "--out", expected=expected, got="none", remedy=remedy)
+    settings = film_settings(film, name, fps, size, renderer)
+    if out is not None:
+        check_target(out)
+    else:
+        others = {"--n": n, "--duration": duration, "--clip": clip, "--workers": workers}
+        leave_out({**others, "--scheduler": scheduler}, "without --out")
     found = _twin(twin, inputs, outputs, rate, servo, no_meshes)
     system = _case(case, twin, found)
-    faults = _faults(system, fault)
-    require(
-        duration is None or (commands is None and system is None),
-        "--duration",
-        expected="none with commands of a file or of a case",
-        got=duration,
-        remedy="leave it out",
-    )
-    if commands is not None:
-        drawn = read(commands, system, max_bytes=max_bytes)
-    else:
-        drawn, n = _sampler(system, found, duration), len(faults) if n is None else n
-    plan = SimulationPlan(found, drawn, seed, n, faults, clip=clip, chunk=chunk)
-    carry_out(plan, out, "simulate", workers=workers, scheduler=scheduler)
-
-
-app.command(
-    "animate",
-    epilog=example("retwin twin animate real.mat --case armpi --id 00036 --out arm.mp4"),
-)(animate)
+    if out is not None:
+        faults = _faults(system, fault)
+        if commands is not None:
+            leave_out({"--duration": duration}, "with commands of a file")
+            drawn = read(commands, system, max_bytes=max_bytes)
+        else:
+            drawn, n = _sampler(system, found, duration), len(faults) if n is None else n
+        plan = SimulationPlan(found, drawn, seed, n, faults, clip=clip, chunk=chunk)
+        carry_out(plan, out, "simulate", workers=workers, scheduler=scheduler)
+    if film is not None and filmed is not None:
+        trajectories = read(filmed, system, max_bytes=max_bytes)
+        draw_film(film, trajectories, found, system, settings, seed)
 
 
 def _twin(
@@ -287,6 +319,7 @@ def _faults(system: Case | None, fault: str) -> dict[str, Any]:
 def _sampler(system: Case | None, found: Twin, duration: float | None) -> Any:
     """The sampler of the case, or ramps within the limits of the twin."""
     if system is not None:
+        leave_out({"--duration": duration}, "with commands of a case")
         return system.sampler
     limits = getattr(found, "limits", None)
     bounded = limits is not None and all(map(isfinite, limits.low + limits.high))

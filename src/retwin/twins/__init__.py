@@ -172,8 +172,27 @@ def _of_function(
         )
     from retwin.twins.function import FunctionTwin
 
+    _check_one_array(name, function, inputs)
     commands, results = (Channels(tuple(n), ("1",) * len(n)) for n in (inputs, outputs))
     return FunctionTwin(function, commands, results, rate)
+
+
+def _check_one_array(name: str, function: Callable[..., Any], inputs: Sequence[str]) -> None:
+    """Refuse a function that takes an array of each command: its order is not that of `inputs`."""
+    try:
+        signature = inspect.signature(function)
+        signature.bind(0, **{each: 0 for each in ("rng", "rate") if each in signature.parameters})
+    except TypeError as error:
+        passed = ", ".join(f"{each}=u[..., {i}]" for i, each in enumerate(inputs))
+        raise InputError(
+            f"twin {name!r}",
+            expected="a function of one array of commands u, (n, T, d_u), and of numbers with "
+            "defaults",
+            got=f"{name.rpartition(':')[2]}{signature}, {error}",
+            remedy=f"name a function of u that calls it by names, with {passed}",
+        ) from None
+    except ValueError:  # some compiled functions have no signature
+        return
 
 
 def _needs_no_arguments(function: Callable[..., Any]) -> bool:

@@ -200,7 +200,7 @@ def test_what_it_names_is_not_run(
     (folder / "model.json").write_text(json.dumps(about | {"case": "evil:case"}))
     seal(folder)
     assert Bundle.load(folder).facts.case == "evil:case"
-    code, _, err = call("bundle", "generate", folder, "--out", tmp_path / "made.npz")
+    code, _, err = call("generate", folder, "--out", tmp_path / "made.npz")
     assert code == 2
     assert "give the case" in err
     faults = about["faults"] | {"Healthy": {"kind": "evil:Fault"}}
@@ -267,26 +267,24 @@ def test_the_commands(call: Call, bundle: Bundle, saved: Path, tmp_path: Path) -
         *("folder", "kind", "bytes", "case", "schema", "steps", "movements", "sensor_rate"),
         "provenance",
     }
-    code, out, err = call(
-        "bundle", "generate", saved, "--per-class", 2, "--out", tmp_path / "made.npz"
-    )
+    code, out, err = call("generate", saved, "--per-class", 2, "--out", tmp_path / "made.npz")
     assert code == 0, err
     made = rt.load(tmp_path / "made.npz")
     rt.save(made.replace(observed=1.5 * made.observed), tmp_path / "scaled.npz")
     code, out, err = call(
-        "bundle", "predict", saved, tmp_path / "scaled.npz", "--out", tmp_path / "found.csv"
+        "diagnose", "predict", saved, tmp_path / "scaled.npz", "--out", tmp_path / "found.csv"
     )
     assert code == 0, err
     assert "outside" in out
-    code, out, _ = call("bundle", "predict", saved, tmp_path / "scaled.npz", "--json")
+    code, out, _ = call("diagnose", "predict", saved, tmp_path / "scaled.npz", "--json")
     printed = json.loads(out)
-    assert printed.keys() == {"emulated", "trajectories"}
+    assert printed.keys() == {"emulated", "remark", "trajectories", "scores"}
     assert len(printed["trajectories"]) == len(made)
     assert printed["trajectories"][0].keys() == {
-        *("id", "diagnosis", "probability", "probabilities", "guard", "because_of")
+        *("id", "diagnosis", "probability", "probabilities", "guard", "reason")
     }
     rows = (tmp_path / "found.csv").read_text().splitlines()
-    assert rows[0].split(",")[:4] == ["trajectory", "diagnosis", "guard", "because_of"]
+    assert rows[0].split(",")[:4] == ["trajectory", "diagnosis", "guard", "reason"]
     assert len(rows) == 1 + len(made)
 
 

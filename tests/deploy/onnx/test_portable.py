@@ -328,7 +328,7 @@ def test_a_forged_graph_is_refused(
     onnx.save(model, file)
     seal(folder)
     forged = Portable.load(folder)
-    with pytest.raises(rt.InputError, match=rf"{name}\.onnx.*retwin bundle export"):
+    with pytest.raises(rt.InputError, match=rf"{name}\.onnx.*retwin export onnx"):
         forged.predict(emulated[:3])
 
 
@@ -459,9 +459,9 @@ def test_an_export_of_schema_1_names_the_command_that_makes_it_anew(
     (folder / "model.json").write_text(json.dumps(about | {"schema": 1}))
     seal(folder)
     rt.save(emulated, tmp_path / "real.npz")
-    code, out, err = call("bundle", "predict", folder, tmp_path / "real.npz")
+    code, out, err = call("diagnose", "predict", folder, tmp_path / "real.npz")
     assert (code, out) == (2, "")
-    assert "got 'portable' of schema 1; make it anew with retwin bundle export" in err
+    assert "got 'portable' of schema 1; make it anew with retwin export onnx" in err
 
 
 def test_what_has_no_graph_is_named(bundle: Bundle, tmp_path: Path) -> None:
@@ -499,18 +499,18 @@ def test_the_commands_export_and_predict(
     call, saved: Path, exported: Exported, emulated: rt.Trajectories, tmp_path: Path
 ) -> None:
     rt.save(emulated, tmp_path / "real.npz")
-    code, out, err = call("bundle", "predict", exported[0], tmp_path / "real.npz")
+    code, out, err = call("diagnose", "predict", exported[0], tmp_path / "real.npz")
     assert code == 0, err
     assert "EMULATED" in out
     observed = emulated.observed.copy()
     observed[0, 500, 0] = 3.4e38
     rt.save(emulated.replace(observed=observed), tmp_path / "odd.npz")
     for folder in (saved, exported[0]):
-        odd = ("bundle", "predict", folder, tmp_path / "odd.npz", "--out", tmp_path / "odd.csv")
+        odd = ("diagnose", "predict", folder, tmp_path / "odd.npz", "--out", tmp_path / "odd.csv")
         code, out, err = call(*odd, "--json")
         assert (code, "Warning" in err) == (0, False), err
         first = json.loads(out)["trajectories"][0]
-        assert (first["diagnosis"], first["guard"], first["because_of"]) == (
+        assert (first["diagnosis"], first["guard"], first["reason"]) == (
             *("unknown", "outside", "outputs"),
         )
         assert first["probability"] is None
@@ -519,11 +519,11 @@ def test_the_commands_export_and_predict(
         assert rows[1].split(",")[1:] == ["unknown", "outside", "outputs", *[""] * 9]
         assert len(rows) == 1 + len(emulated)
         assert call(*odd)[0] == 0
-    words = ("bundle", "export", saved, "--onnx", tmp_path / "again", "--json")
+    words = ("export", "onnx", saved, "--out", tmp_path / "again", "--json")
     printed = json.loads(call(*words)[1])
     assert printed.keys() == {"saved", "differences"}
     assert max(printed["differences"].values()) < 0.01
-    code, _, err = call("bundle", "export", exported[0], "--onnx", tmp_path / "out")
+    code, _, err = call("export", "onnx", exported[0], "--out", tmp_path / "out")
     assert code == 2
     assert "expected a bundle of schema 1" in err
 

@@ -19,7 +19,7 @@ from retwin.data.logs.mapping import ChannelMapping, Cut, Mapping, TimeSettings
 from retwin.data.logs.proposal_text import Chosen, Fact, mapping_text, units_of
 from retwin.data.logs.reading import log_format, read_log
 from retwin.data.logs.signals import NANOSECOND, NO_STAMP, Log, Signal
-from retwin.data.logs.units import compatible
+from retwin.data.logs.units import compatible, unit_in_name
 from retwin.data.resampling import BRIDGED
 from retwin.errors import InputError
 from retwin.progress import Progress
@@ -188,7 +188,7 @@ def _fact(signal: Signal) -> Fact:
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
     return Fact(
         signal.name,
-        signal.unit,
+        signal.unit or unit_in_name(signal.name),
         len(values),
         1 / typical if typical > 0 else 0.0,
         float(steps.max(initial=0.0)),
@@ -246,7 +246,10 @@ def proposed(
     tables = {
         name: {
             channel: channel_mapping(log.signals[fact.name], name, rate, cut).model_copy(
-                update={"unit": units.get(channel)}
+                update={
+                    "unit": units.get(channel),
+                    "from_unit": None if log.signals[fact.name].unit else fact.unit or None,
+                }
             )
             for channel, fact in table.items()
             if fact

@@ -25,7 +25,7 @@ class Fact:
     Attributes
     ----------
     name, unit : str
-        Of the signal.
+        Of the signal; where the log states no unit, that in which its name ends.
     count : int
         Its values.
     rate : float

@@ -36,6 +36,25 @@ SPELT = {
 }
 """Spellings in logs, and those of pint. C is a temperature there, no charge."""
 
+ENDING = re.compile(
+    r"_((?:um|mm|cm|km|m?rad|deg[CF]?|rpm|k?Hz|[um]s|Nm|kN|[hkM]?Pa|m?bar|m[VA]|kWh?|kg|percent|pct)"
+    r"(?:_(?:s|s2|h|min))?|[mlg]_(?:s|s2|h|min)|mps|kmh)$"
+)
+"""How names of signals end that state a unit, as `position_mm` and `speed_m_s`.
+
+A single letter is none: `phase_A` and `torque_m` are no currents and lengths.
+"""
+SHORT = {"mps": "m/s", "kmh": "km/h", "Nm": "N m", "pct": "%"}
+
+
+def unit_in_name(name: str) -> str:
+    """The unit with which the name of a signal ends, after an underscore; "" if with none."""
+    found = ENDING.search(name)
+    if found is None:
+        return ""
+    unit, _, per = found[1].partition("_")
+    return SHORT.get(unit, unit) + (f"/{per.replace('s2', 's^2')}" if per else "")
+
 
 def same_unit(first: str, second: str) -> bool:
     """Whether two units are the same text, or both stand for no unit."""

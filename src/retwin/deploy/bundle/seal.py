@@ -26,7 +26,7 @@ Exports of schema 1 named inputs of their graphs otherwise, so they are refused.
 """
 REMEDIES = {
     "bundle": "make it anew with Bundle.save",
-    "portable": "make it anew with retwin bundle export",
+    "portable": "make it anew with retwin export onnx",
 }
 EXPECTED = {"bundle": "a bundle", "portable": "the ONNX export of a bundle"}
 

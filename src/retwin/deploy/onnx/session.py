@@ -16,10 +16,10 @@ from retwin.serialisation.sizes import Budget
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-EXPECTED = "a graph that retwin bundle export wrote"
+EXPECTED = "a graph that retwin export onnx wrote"
 TIMEOUT, TIMEOUT_PER_ROW = 60.0, 0.1
 """Longest duration in s of a run, and what each trajectory adds: a graph may loop for ever."""
-REMEDY = "make it anew with retwin bundle export, or give it less at once if memory is short"
+REMEDY = "make it anew with retwin export onnx, or give it less at once if memory is short"
 
 
 class Session:

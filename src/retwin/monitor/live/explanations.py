@@ -6,20 +6,22 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Container, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from retwin.checks import require
-from retwin.data.trajectories import HEALTHY, UNKNOWN
+from retwin.data.trajectories import UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.live.live import Live
 from retwin.monitor.models.cause import (
     BEFORE,
+    EVENT,
     MIN_WINDOW,
     Cause,
     cause_data,
-    find_causes,
+    find_cause,
     possible_causes,
 )
 from retwin.monitor.models.monitor import Monitor
@@ -37,10 +39,9 @@ Faults = Callable[[str], "dict[str, Fault | None] | None"]
 class Explanations:
     """A thread that explains each alarm from the stored samples before it.
 
-    A context manager that ends the thread. What is found is an entry `cause` of the log. Of further
-    alarms of an event it is a second fault if it began after the alarm before; else the fault is
-    still the `same`, or its state comes back. Alarms
-    that have none, since the program was stopped, are explained when it is started again.
+    A context manager that ends the thread. What is found is an entry `cause` of the log; of further
+    alarms of an event it tells whether the fault is the `same`, see `find_cause`. Alarms that have
+    none, since the program was stopped, are explained when it is started again.
 
     Parameters
     ----------
@@ -63,12 +64,16 @@ class Explanations:
         self._live = live
         self._faults = faults
         self._report = report
-        self._queue: queue.Queue[tuple[Entry, int] | None] = queue.Queue()
-        self._before: dict[str, int] = {}
+        self._queue: queue.Queue[list[Entry] | None] = queue.Queue()
+        self._alarms: dict[str, list[Entry]] = {}
+        self._current: dict[str, dict[str, Any]] = {}
         self._closed = threading.Event()
         self._taking = threading.Lock()
         self._last = -1
-        explained = {entry.data["alarm"] for entry in live.store.log("cause")}
+        explained = set()
+        for entry in live.store.log("cause"):
+            explained.add(entry.data["alarm"])
+            self._keep(entry.data)
         with self._taking:  # alarms that are raised meanwhile are taken after the earlier ones
             live.listen(self._on_entries)
             self._take(live.store.log("alarm"), explained)
@@ -105,54 +110,62 @@ class Explanations:
                 self._take(each for each in alarms if each.sequence > self._last)
 
     def _take(self, alarms: Iterable[Entry], explained: Container[int] = ()) -> None:
-        """Queue alarms, each with the time of the alarm before it of the same machine."""
+        """Queue alarms, each after the first and the newest of its event, or those before it."""
         for entry in alarms:
             asset = entry.data["asset"]
+            known = self._alarms.get(asset, [])
+            if known and known[0].data.get("version") != entry.data.get("version"):
+                known = []
             if entry.sequence not in explained and "cause" not in entry.data:
-                self._queue.put((entry, self._before.get(asset, 0)))
-            self._before[asset] = entry.data["time"]
+                self._queue.put([*known, entry])
+            same = known and _event(known[0].data) == _event(entry.data)
+            newest = known[1:][-MIN_WINDOW:]
+            self._alarms[asset] = [*known[:1], *newest, entry] if same else [entry]
             self._last = entry.sequence
+
+    def _keep(self, cause: dict[str, Any]) -> None:
+        """Keep what the newest event of a machine is explained by."""
+        if not cause.get("same"):
+            self._current[cause["asset"]] = cause
 
     def _run(self) -> None:
         while not self._closed.is_set():
             waiting = self._queue.get()
             try:
                 if waiting is not None:
-                    self._explain(*waiting)
+                    self._explain(waiting)
             except InputError:
                 pass  # It could not be stored, so the alarm is explained after the next start.
             finally:
                 self._queue.task_done()
 
-    def _explain(self, entry: Entry, before: int) -> None:
+    def _explain(self, alarms: list[Entry]) -> None:
+        entry = alarms[-1]
         alarm = entry.data
         try:
-            found = _data(*self._found(alarm, before))
+            found = _data(*self._found(alarms))
         except Exception as error:  # Whatever fails is an entry, and the next alarm is explained.
-            found = cause_data(UNKNOWN, 0.0, 1.0, {}) | {"note": brief(error)}
-        begun = found["onset"][1]
-        same = alarm.get("event", alarm["time"]) != alarm["time"] and (
-            found["name"] == HEALTHY or begun is None or begun <= before
-        )
-        found |= {"alarm": entry.sequence, "asset": alarm["asset"], "same": same}
+            same = _event(alarm) != alarm["time"]
+            found = cause_data(UNKNOWN, 0.0, 1.0, {}) | {"note": brief(error), "same": same}
+        found |= {"alarm": entry.sequence, "asset": alarm["asset"]}
         self._live.log([("cause", found)])
+        self._keep(found)
         try:
             self._report(alarm, found)
         except Exception:  # of the caller; further alarms are explained all the same
             logging.getLogger(__name__).exception("a cause was found but not reported")
 
-    def _found(self, alarm: dict[str, Any], before: int) -> tuple[Cause, int]:
-        """The cause of an alarm, and the time of the first sample that it was found from."""
-        store, name = self._live.store, alarm["asset"]
+    def _found(self, entries: list[Entry]) -> tuple[Cause, int]:
+        """The cause of the last alarm, and the time of the first sample that it was found from."""
+        store, last = self._live.store, entries[-1].data
+        name = last["asset"]
         twin = next(each for each in store.assets() if each.name == name).settings["twin"]
-        monitor = Monitor.load(Registry(store, twin).folder(alarm["version"]))
+        monitor = Monitor.load(Registry(store, twin).folder(last["version"]))
         period = SECOND / monitor.twin.rate
-        window = round(min(BEFORE, alarm["sample"]) * period)
-        if alarm["time"] - before > MIN_WINDOW * period:
-            window = min(window, alarm["time"] - before - round(period / 2))
+        opening = max(_event(last) - round(BEFORE * period), last["time"] - round(EVENT * period))
+        begin = max(opening, last["time"] - round(last["sample"] * period))
         half = round(period / 2)
-        begin, end = alarm["time"] - window - half, alarm["time"] + half
-        times, values = gridded(store, name, monitor.twin, begin, end)
+        times, values = gridded(store, name, monitor.twin, begin - half, last["time"] + half)
         require(
             len(times) >= 2,
             "samples",
@@ -161,11 +174,25 @@ class Explanations:
             remedy="store more of them: see max_samples",
         )
         record = record_of(monitor.twin, values)
-        about = alarm["output"], alarm["change"], alarm["evidence"]
-        own = Alarm("", record.steps - 1, 0.0, *about, 0, True, tuple(alarm["machine"]))
+        *earlier, newest = [_alarm(each.data, int(times[0]), period) for each in entries]
+        alarms = [*earlier, replace(newest, sample=record.steps - 1)]
+        cause = self._current.get(name, {"alarm": -1})
+        current = cause["name"] if cause["alarm"] >= entries[0].sequence else ""
         known = self.causes(twin, monitor)
-        (cause,) = find_causes(monitor.twin, record, [own], known, known_start=False)
-        return cause, int(times[0])
+        found = find_cause(monitor.twin, record, alarms, known, current=current, known_start=False)
+        return found, int(times[0])
+
+
+def _alarm(data: dict[str, Any], first: int, period: float) -> Alarm:
+    """An alarm of the log in a record whose first sample was at a time in nanoseconds."""
+    sample, event = (round((time - first) / period) for time in (data["time"], _event(data)))
+    about = data["output"], data["change"], data["evidence"]
+    return Alarm("", sample, 0.0, *about, event, True, tuple(data["machine"]))
+
+
+def _event(alarm: dict[str, Any]) -> int:
+    """The time of the first alarm of an alarm's event."""
+    return int(alarm.get("event", alarm["time"]))
 
 
 def _data(cause: Cause, first: int) -> dict[str, Any]:
@@ -173,4 +200,4 @@ def _data(cause: Cause, first: int) -> dict[str, Any]:
     size = [each if np.isfinite(each) else None for each in cause.size]
     onset = [first + round(each * SECOND) if np.isfinite(each) else None for each in cause.onset]
     shares = cause.probability, cause.unknown, cause.probabilities
-    return cause_data(cause.name, *shares, size, onset)
+    return cause_data(cause.name, *shares, size, onset) | {"same": cause.same}

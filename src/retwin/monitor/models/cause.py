@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from retwin.checks import require, whole
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.estimate import Estimate
+from retwin.diagnosis.fault_evidence import FaultEvidence
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.monitor.models.watched import Alarm
 from retwin.twins.faults.actuator_faults import Fault
@@ -21,17 +23,20 @@ from retwin.twins.faults.system_faults import (
     SensorBias,
     SensorDrift,
     SensorFreeze,
+    SizedFault,
     TimedFault,
 )
 from retwin.update.dynamics.online import moved
 from retwin.update.dynamics.twin import DynamicsTwin
 
 UNEXPLAINED = 0.5
-"""Probability from which on it is told that a cause does not explain all."""
+"""Probability from which on a cause does not explain all, or is the one that is named."""
 BEFORE = 100
 """Samples before an alarm from which its cause is inferred."""
 MIN_WINDOW = 10
-"""Samples of a window, at least; the one of an earlier alarm is left out where more remain."""
+"""A window begins after the newest earlier alarm that leaves it more samples than this."""
+EVENT = 500
+"""Samples of an event that are looked at, at most, to tell whether a second fault began in it."""
 
 PARTS = ("value", "low", "high")
 """Of an estimate."""
@@ -57,6 +62,9 @@ class Cause:
         NaN where the class has none.
     probabilities : dict of str to float
         Of all classes.
+    same : bool
+        Whether its event has a cause already, which explains this alarm too; else it is the first
+        one of the event, or a further one.
 
     """
 
@@ -67,6 +75,7 @@ class Cause:
     size: tuple[float, float, float]
     onset: tuple[float, float, float]
     probabilities: dict[str, float]
+    same: bool = False
 
 
 def cause_title(name: str) -> str:
@@ -178,7 +187,7 @@ def find_causes(
         the alarm and lasts until it.
     before : int
         Number of samples before an alarm from which its cause is inferred. They begin after the
-        alarm before it, if that is later and leaves ten samples.
+        newest alarm before it that leaves more than ten samples, if that is later.
     known_start : bool
         Whether the record starts as those in calibration do; a stream may start anywhere.
 
@@ -189,7 +198,8 @@ def find_causes(
 
     """
     whole("before", before, least=MIN_WINDOW)
-    ids, found, last = record.ids.tolist(), [], dict[str, int]()
+    ids, found, earlier = record.ids.tolist(), [], dict[str, list[Alarm]]()
+    current = dict[tuple[str, int], str]()
     for alarm in alarms:
         require(
             alarm.trajectory in ids and alarm.sample < record.steps,
@@ -198,38 +208,131 @@ def find_causes(
             got=f"one of {alarm.trajectory!r} at sample {alarm.sample}",
             remedy="give the record that was watched",
         )
-        first = max(0, alarm.sample - before)
-        if alarm.sample - last.get(alarm.trajectory, -1) > MIN_WINDOW:
-            first = max(first, last.get(alarm.trajectory, -1) + 1)
-        last[alarm.trajectory] = alarm.sample
-        begin, end = first / record.rate, (alarm.sample + 1) / record.rate
-        window = record[[ids.index(alarm.trajectory)]].between(begin, end)
-        latest = (alarm.sample - first) / record.rate
-        own = {
-            name: replace(each, onset=(0.0, latest), end=None)
-            if isinstance(each, TimedFault)
-            else each
-            for name, each in faults.items()
-        }
-        made = StateInversionDiagnoser(moved(twin, alarm.machine), own).diagnose(
-            window, known_start=known_start and first == 0
+        one = record[[ids.index(alarm.trajectory)]]
+        event, before_it = (alarm.trajectory, alarm.event), earlier.get(alarm.trajectory, [])
+        cause = find_cause(
+            twin,
+            one,
+            [*before_it, alarm],
+            faults,
+            before,
+            current=current.get(event, ""),
+            known_start=known_start,
         )
-        best = int(made.probabilities[0].argmax())
-
-        def interval(estimate: Estimate, best: int = best) -> tuple[float, float, float]:
-            value, low, high = (getattr(estimate, part)[0, best] for part in PARTS)
-            return float(value), float(low), float(high)
-
-        onset = interval(made.onset)
-        found.append(
-            Cause(
-                alarm,
-                made.classes[best],
-                float(made.probabilities[0, best]),
-                float(made.unknown[0]),
-                interval(made.size),
-                (begin + onset[0], begin + onset[1], begin + onset[2]),
-                dict(zip(made.classes, made.probabilities[0].tolist(), strict=True)),
-            )
-        )
+        earlier[alarm.trajectory] = [*before_it, alarm]
+        if not cause.same:
+            current[event] = cause.name
+        found.append(cause)
     return found
+
+
+def find_cause(
+    twin: DynamicsTwin,
+    record: Trajectories,
+    alarms: Sequence[Alarm],
+    faults: Mapping[str, Fault | None],
+    before: int = BEFORE,
+    *,
+    current: str = "",
+    known_start: bool = True,
+) -> Cause:
+    """The cause of the last of a trajectory's alarms, see `find_causes`.
+
+    A further alarm of an event is the `same` fault, and no second one, unless another class is
+    probable for what came after the alarm before it, began after that, and both faults together
+    have more evidence than the first one alone, which lasts or has ended.
+
+    Parameters
+    ----------
+    current : str
+        The cause that the event has; "" for none.
+
+    """
+    alarm = alarms[-1]
+    earlier = [each for each in alarms[:-1] if alarm.sample - each.sample > MIN_WINDOW]
+    last = earlier[-1].sample if earlier else -1
+    first = max(0, alarm.sample - before, last + 1)
+    begin, window = first / record.rate, _window(record, first, alarm.sample)
+    latest = (alarm.sample - first) / record.rate
+    open_ = {name: _lasting(fault, latest) for name, fault in faults.items()}
+    made = StateInversionDiagnoser(moved(twin, alarm.machine), open_).diagnose(
+        window, known_start=known_start and first == 0
+    )
+    best = int(made.probabilities[0].argmax())
+
+    def interval(estimate: Estimate) -> tuple[float, float, float]:
+        value, low, high = (getattr(estimate, part)[0, best] for part in PARTS)
+        return float(value), float(low), float(high)
+
+    onset = interval(made.onset)
+    cause = Cause(
+        alarm,
+        made.classes[best],
+        float(made.probabilities[0, best]),
+        float(made.unknown[0]),
+        interval(made.size),
+        (begin + onset[0], begin + onset[1], begin + onset[2]),
+        dict(zip(made.classes, made.probabilities[0].tolist(), strict=True)),
+    )
+    if alarm.event not in [each.event for each in alarms[:-1]]:
+        return cause
+    likely = cause.probability * (1 - cause.unknown) > UNEXPLAINED
+    begun = cause.onset[1] > last / record.rate  # the healthy class has no onset
+    same = cause.name == current or not (begun and likely)
+    known, own = faults.get(current), [each for each in earlier if each.event == alarm.event]
+    if not same and own and isinstance(known, TimedFault):
+        both = known, faults[cause.name]
+        same = not _second(twin, record, [*own, alarm], both, np.log(len(faults)))
+    return replace(cause, same=same)
+
+
+def _second(
+    twin: DynamicsTwin,
+    record: Trajectories,
+    alarms: Sequence[Alarm],
+    faults: tuple[TimedFault, Fault | None],
+    penalty: float,
+) -> bool:
+    """Whether a second fault began after the last alarm but one of an event.
+
+    Compared is the evidence in the same samples. After that alarm the states are unknown again if
+    there is a second fault; the first one, if it has ended, had its most probable size and onset.
+    """
+    opening, previous, last = alarms[0], alarms[-2].sample, alarms[-1].sample
+    first = max(0, opening.sample - BEFORE, last - EVENT)
+    if previous - first < MIN_WINDOW:
+        return True
+    healthy = moved(twin, opening.machine)
+
+    def evidence(
+        begin: int, end: int, fault: Fault | None, of: DynamicsTwin = healthy
+    ) -> tuple[float, NDArray]:
+        model = FaultEvidence.of(of, _window(record, begin, end), known_start=False)
+        known = fault if isinstance(fault, TimedFault) else None
+        found = model.integral(known)
+        return model.tolerated(known, found).evidence, found.best
+
+    def lasts(begin: int, end: int, fault: Fault | None) -> Fault | None:
+        return _lasting(fault, (end - begin) / record.rate)
+
+    one, other = faults
+    until, (size, onset, _) = evidence(first, previous, lasts(first, previous, one))
+    onset, after = onset / record.rate, (last + 1 - first) / record.rate
+    point = replace(one, onset=onset, end=None)
+    if isinstance(point, SizedFault):
+        point = replace(point, size=float(size))
+    end = replace(point, end=(onset + 1 / record.rate, after))
+    ended = until + evidence(first, last, end)[0] - evidence(first, previous, point)[0]
+    whole_event = evidence(first, last, lasts(first, last, one))[0]
+    begun = lasts(previous + 1, last, other)
+    again = evidence(previous + 1, last, begun, moved(twin, alarms[-1].machine))[0]
+    return bool(until + again - penalty > np.logaddexp(whole_event, ended))
+
+
+def _lasting(fault: Fault | None, latest: float) -> Fault | None:
+    """A fault that begins at any time until `latest` in s, and lasts."""
+    return replace(fault, onset=(0.0, latest), end=None) if isinstance(fault, TimedFault) else fault
+
+
+def _window(record: Trajectories, first: int, last: int) -> Trajectories:
+    return record.between(first / record.rate, (last + 1) / record.rate)

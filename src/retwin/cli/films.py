@@ -1,0 +1,72 @@
+"""Films of a trajectory: the options of `retwin twin simulate --film`, and the drawing."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from retwin.checks import given
+from retwin.cli.options import leave_out, option, rare
+from retwin.cli.terminal import answer, bar
+
+if TYPE_CHECKING:
+    from retwin.cases.case import Case
+    from retwin.data.trajectories import Trajectories
+    from retwin.twins.twin import Twin
+
+Film = Annotated[Path | None, option("FILE", "Film of --out, else of --commands: *.mp4 or *.gif.")]
+FilmedId = Annotated[str | None, rare("ID", "The filmed trajectory; else the first.", "--id")]
+FramesPerSecond = Annotated[float | None, rare("HZ", "Pictures of the film per second; else 25.")]
+FilmSize = Annotated[str | None, rare("WxH", "Of the film; else 640x480.")]
+Renderer = Annotated[Literal["mujoco", "stick"] | None, rare("", "What draws; else the best here.")]
+
+
+def film_settings(
+    film: Path | None, name: str | None, fps: float | None, size: str | None, renderer: str | None
+) -> dict[str, Any]:
+    """The settings of a film that were given, checked before the work."""
+    if film is None:
+        others = {"--id": name, "--fps": fps, "--size": size, "--renderer": renderer}
+        leave_out(others, "without --film")
+        return {}
+    from retwin.cases.animation.film import check_film
+
+    check_film(film)
+    made = {"index": name, "fps": fps, "size": size and _size(size), "renderer": renderer}
+    return {name: value for name, value in made.items() if value is not None}
+
+
+def draw_film(
+    film: Path,
+    trajectories: Trajectories,
+    twin: Twin,
+    system: Case | None,
+    settings: dict[str, Any],
+    seed: int,
+) -> None:
+    """Film a trajectory, with the bands of a corrected twin."""
+    from retwin.cases.animation import animate
+    from retwin.update import CorrectedTwin, DynamicsTwin
+
+    expected, remedy = "the case of the trajectories, which draws them", "give --case NAME"
+    case = given("--case", system, expected, remedy=remedy)
+    updated = twin if isinstance(twin, CorrectedTwin | DynamicsTwin) else None
+    with bar("film") as show:
+        path = animate(
+            trajectories,
+            case,
+            film,
+            updated=updated,
+            seed=seed,
+            progress=lambda share: show("draw", share),
+            **settings,
+        )
+    answer(path, str(path))
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    expected, remedy = "WIDTHxHEIGHT in pixels", "give it like 640x480"
+    found = given("--size", found, expected, got=repr(text), remedy=remedy)
+    return int(found[1]), int(found[2])
