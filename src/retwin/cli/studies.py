@@ -162,6 +162,8 @@ def demo(
     minutes = DEMO_MINUTES * plan.number_of_runs
     note(f"Compares on {kind} data, within {minutes} minutes on two quiet cores: {titles}.")
     _run(rt.cases.get("armpi"), plan, data, target, as_json=as_json)
+    note("Next: watch a machine live with retwin monitor run --demo --open;")
+    note("or start with a twin and records of your own: retwin identify --help.")
 
 
 def _run(

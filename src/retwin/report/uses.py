@@ -112,7 +112,7 @@ def _missing(use: Use, *, faults: bool) -> str:
         "faulty": f"{several} more faulty run{'s' * (several != 1)}" if several else "faulty runs",
         "records": f"{several} more test record{'s' * (several != 1)}" if several else "records",
         "test": "more test runs",
-        "runs": f"training it {several} times (--runs {several})",
+        "runs": f"training it {several} times (give --runs)",
         "faults": "runs with known faults" if faults else "records with known faults",
         "classifier": "an updated twin beside the original one",
         "correction": "another correction",
