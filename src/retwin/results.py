@@ -133,6 +133,66 @@ class OverlayInfo(ResultsPart):
     latent_units: list[str] = Field([], alias="movement_units")
 
 
+class Figure(ResultsPart):
+    """A figure of a use, its interval, the original twin's on the same runs, and their number.
+
+    `unit` is that of the outputs; "" of a share or a score.
+    """
+
+    value: Number = math.nan
+    interval: Interval | None = None
+    plain: Number = math.nan
+    unit: str = ""
+    n: int = 0
+
+    @property
+    def ends(self) -> tuple[float, float] | None:
+        """The interval; None if there is none."""
+        return finite_interval(self.interval)
+
+
+class Missing(ResultsPart):
+    """The one thing that a use lacks.
+
+    `what` is "healthy" or "faulty" (runs), "test" (runs of any class), "records", "runs" (of
+    training), "faults", "classifier", "correction", "source" or "real"; `count` is how many more,
+    of "runs" how many in all, and None where it is not known.
+    """
+
+    what: str
+    count: int | None = None
+
+
+class Use(ResultsPart):
+    """What an updated twin may be used for, see `retwin.scores.uses`.
+
+    Attributes
+    ----------
+    use : str
+        "simulate", "training", "diagnose" or "monitor".
+    answer : str
+        "yes", "likely", "cannot say" or "no".
+    source, plain : str
+        The best source, and the original twin beside it; "" without one.
+    figures : dict of str to Figure
+        What it reaches, by name.
+    missing : Missing
+        None if nothing is.
+
+    """
+
+    use: str
+    answer: str
+    source: str = ""
+    plain: str = ""
+    figures: dict[str, Figure] = Field(default={})
+    missing: Missing | None = None
+
+    def with_values(self, **values: object) -> Use:
+        """The use with other values."""
+        return self.model_copy(update=values)
+
+
 class SurrogateError(ResultsPart):
     """Error of the surrogate against the twin, per output; `unit` is that of the RMSE."""
 
@@ -179,6 +239,8 @@ class Results(ResultsPart):
         Seconds of each kind of job; and the command, the seed, versions and the machine.
     overlay : OverlayInfo
         The predictions beside the test trajectories; None if no twin was corrected.
+    uses : list of Use
+        What the best source may be used for; empty in files of versions that did not state it.
 
     """
 
@@ -203,6 +265,7 @@ class Results(ResultsPart):
     timing: dict[str, Any] = Field(default={})
     provenance: dict[str, Any] = Field(default={})
     overlay: OverlayInfo | None = Field(None, alias="portrait")
+    uses: list[Use] = Field(default=[])
 
     @model_validator(mode="after")
     def _consistent(self) -> Results:

@@ -351,20 +351,22 @@ def test_the_summary_prints_on_one_sheet(sheet: Page) -> None:
 
 
 def test_the_first_screen_answers(browser: Browser, study_page: Path) -> None:
-    """Before anything is opened: the error, the uses, what is next, the lights, the objections."""
+    """Before anything is opened: four uses with their answers, and what is missing."""
     with browser.new_context(offline=True, viewport=SCREEN) as context:
         page = context.new_page()
         page.set_default_timeout(PATIENCE)
         page.goto(study_page.as_uri())
         page.wait_for_selector("#plot-summary-0 .main-svg")
         assert page.locator("details.part[open]").count() == 0
-        text = page.inner_text(".answer")
-        assert re.search(r"Error on healthy runs: [\d.]+ → [\d.]+ mm\.", text)
-        assert "Ready for:" in text
-        assert "Record at least" in text
-        assert page.locator(".lights > div").count() == 4
-        assert "emulated" in page.inner_text(".against")
-        box = page.locator(".lights").bounding_box()
+        rows = page.locator(".uses tbody tr")
+        assert rows.count() == 4
+        answers = [rows.nth(row).locator("td").first.inner_text() for row in range(4)]
+        assert set(answers) <= {"yes", "likely", "cannot say", "no"}
+        text = page.inner_text(".uses").replace("\u00a0", " ")
+        assert re.search(r"Error [\d.]+ mm → [\d.]+ mm", text)
+        assert "more healthy runs" in text
+        assert "emulated" in page.inner_text(".rule")
+        box = page.locator(".uses").bounding_box()
         assert box is not None
         assert box["y"] + box["height"] < SCREEN["height"]
         page.click("nav a[href='#explorer']")

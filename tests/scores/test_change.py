@@ -11,8 +11,6 @@ from scipy.stats import binom
 from retwin.scores.change import ErrorChange, error_change, needed_to_decide
 from retwin.scores.decisions import (
     certain_decision,
-    decide,
-    detection_difference,
     healthy_needed,
 )
 
@@ -88,18 +86,3 @@ def test_too_few_for_certainty() -> None:
     truth = np.repeat([0, 1], [10, 5])
     fault = np.linspace(0, 1, 15)
     assert certain_decision(probabilities(fault), truth, CLASSES, 0.1) is None
-
-
-def test_detection_is_compared_at_the_same_rate() -> None:
-    rng = np.random.default_rng(0)
-    truth = np.repeat([0, 1], 40)
-    good = np.concatenate([0.1 * rng.random(40), 0.9 + 0.1 * rng.random(40)])
-    poor = rng.random(80)
-    found = detection_difference(probabilities(good), probabilities(poor), truth, CLASSES, 0.1)
-    assert found is not None
-    difference, (low, high) = found
-    both = [decide(probabilities(each), truth, CLASSES, 0.1).detected for each in (good, poor)]
-    assert difference == pytest.approx(both[0] - both[1])
-    assert 0 < low <= difference <= high
-    same = detection_difference(probabilities(good), probabilities(good), truth, CLASSES, 0.1)
-    assert same == (0.0, (0.0, 0.0))

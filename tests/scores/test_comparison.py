@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from retwin.scores.comparison import compare_runs, compliance, holm, no_verdict, outcome
+from retwin.scores.comparison import compare_runs, holm, no_verdict, outcome
 
 pytestmark = pytest.mark.numerical
 
@@ -70,11 +70,3 @@ def test_which_pairs_get_a_verdict(
     runs: int, records: int | None, kinds: tuple[str, str], reason: str
 ) -> None:
     assert no_verdict(runs=runs, records=records, real_data=kinds) == reason
-
-
-def test_a_requirement_is_open_where_only_the_interval_meets_it() -> None:
-    assert compliance(0.9, (0.86, 0.94), 0.85, 0.95) == "met"
-    assert compliance(0.9, (0.8, 0.97), 0.85, 0.95) == "undecided", "the value alone shows nothing"
-    assert compliance(0.8, (0.75, 0.84), 0.85, 0.95) == "not met"
-    assert compliance(0.9, None, 0.85, 0.95) == "undecided", "nothing is shown without an interval"
-    assert compliance(float("nan"), None, 0.85) == "not measured"

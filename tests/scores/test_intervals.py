@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest, t
 
-from retwin.scores.comparison import compliance
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval, share_interval
+from retwin.scores.uses import COVERAGE, Requirement, answer_of
 
 pytestmark = pytest.mark.numerical
 STUDIES = 1500
@@ -23,7 +23,7 @@ def test_intervals_of_shares_are_scipy_s(count: int, n: int) -> None:
 def test_coverage_of_few_trajectories_contains_the_truth(n: int, dependence: float) -> None:
     """Shares of dependent points in a perfect 90 % band; a bootstrap covers 0.70 to 0.86.
 
-    The light of calibration fails such a generator where its interval misses 0.85 to 0.95.
+    The use of bands refuses such a generator where its interval misses 0.85 to 0.95.
     """
     rng = np.random.default_rng(0)
     hits = failed = 0
@@ -31,7 +31,7 @@ def test_coverage_of_few_trajectories_contains_the_truth(n: int, dependence: flo
         shares = rng.beta(0.9 * dependence, 0.1 * dependence, size=n)
         ends = grouped_share_interval(shares, np.ones(n))
         hits += ends[0] <= 0.9 <= ends[1]
-        failed += compliance(shares.mean(), ends, 0.85, 0.95) == "not met"
+        failed += answer_of(Requirement(shares.mean(), ends, *COVERAGE)) == "no"
     assert hits >= binom.ppf(1e-6, STUDIES, 0.95)
     assert failed <= binom.isf(1e-6, STUDIES, 0.05)
 

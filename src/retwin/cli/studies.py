@@ -19,20 +19,16 @@ from retwin.cli.terminal import answer, bar, command_given, note, plain, resumab
 from retwin.progress import FinishedStage
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from retwin.results import Results
 
 COLUMNS = {name: metric.head for name, metric in catalog.METRICS.items() if metric.head}
 """Scores that are shown, and the heads of their columns."""
-DEMO = ("dt", "ibg", "ibg_rg", "ibg_rg_command", "inversion")
-"""What the demo compares: the method of the paper, and what is best here."""
+DEMO = ("dt", "ibg_rg_command", "inversion")
+"""What the demo compares: the original twin, and what is best here."""
 DEMO_PER_CLASS = 200
 """Generated trajectories per class in the demo, half of a study's, which keeps it short."""
 DEMO_MINUTES = 4
 """Minutes that a run of the demo takes at most on two cores, as measured."""
-VERDICTS = {"better": "better", "worse": "worse", "open": "undecided"}
-"""Outcomes of a comparison in words."""
 COMPARED = {"a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict"}
 """What is printed of a comparison as JSON."""
 StudyFolder = Annotated[Path, option("FOLDER", "Called again, the study goes on there.")]
@@ -148,7 +144,7 @@ def demo(
     import retwin as rt
     from retwin.study import StudyData, StudyPlan
 
-    data, folds = StudyData(), 3
+    data, folds = StudyData(), 2
     folder = os.environ.get("RETWIN_DATA")
     if folder:
         arm = Path(folder) / "armpi"
@@ -166,6 +162,8 @@ def demo(
     minutes = DEMO_MINUTES * plan.number_of_runs
     note(f"Compares on {kind} data, within {minutes} minutes on two quiet cores: {titles}.")
     _run(rt.cases.get("armpi"), plan, data, target, as_json=as_json)
+    note("Next: watch a machine live with retwin monitor run --demo --open;")
+    note("or start with a twin and records of your own: retwin identify --help.")
 
 
 def _run(
@@ -198,9 +196,9 @@ def _run(
     answer(
         _summary(results, page),
         _title(results),
-        _table(results),
+        _uses(results),
         "",
-        *_differences(results),
+        _table(results),
         as_json=as_json,
     )
     note(f"Report: {page}")
@@ -225,6 +223,7 @@ def _summary(results: Results, page: Path) -> dict[str, Any]:
             row.model_dump(include=COMPARED) | {"outcome": outcome_of(row)}
             for row in results.comparisons
         ],
+        "uses": [use.model_dump() for use in results.uses],
         "report": str(page),
     }
 
@@ -268,37 +267,9 @@ def _over_runs(values: list[float]) -> str:
     return mean_and_deviation(values) if np.isfinite(values).all() else "–"
 
 
-def _differences(results: Results) -> list[RenderableType]:
-    """The difference of each source from the plain twin, with its interval and verdict."""
-    from retwin.report.labels import (
-        difference,
-        reason,
-        sentence,
-        source_in_sentence,
-        source_name,
-    )
-    from retwin.report.verdict import outcome_of
+def _uses(results: Results) -> Table:
+    """The four uses, as on the first screen of the page."""
+    from retwin.report.uses import use_rows
 
-    first, metric = next(iter(results.sources)), "macro_f1" if results.classes else "nrmse"
-    found = [
-        row
-        for row in results.comparisons
-        if row.b == first and row.metric == metric and row.interval is not None
-    ]
-    if not found:
-        return []
-    columns = ("source", "difference", "95 % interval", "verdict")
-    rows = [
-        (
-            source_name(row.a),
-            *difference(row, results.outputs.units),
-            VERDICTS.get(outcome_of(row), "none"),
-        )
-        for row in found
-    ]
-    reasons = dict.fromkeys(reason(row) for row in found if not outcome_of(row))
-    return [
-        f"{sentence(COLUMNS[metric])} minus that of {source_in_sentence(first)}",
-        table(columns, rows, numbers=columns[1:3]),
-        *(f"No verdict: {each}." for each in reasons if each),
-    ]
+    rows = [(r.title, r.answer, r.source, r.reached, r.missing) for r in use_rows(results)]
+    return table(("use", "answer", "best source", "what it reaches", "missing"), rows)

@@ -14,7 +14,6 @@ from retwin.report import labels
 from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Section
 from retwin.report.glossary import explained
-from retwin.report.lights import RATE
 from retwin.report.png import png, small
 from retwin.report.sections import sections_of
 from retwin.report.study import Study, read_study
@@ -22,6 +21,7 @@ from retwin.report.summary import picture, summary
 from retwin.report.verdict import outcome_of, verdict
 from retwin.scores.bootstrap import MIN_RECORDS
 from retwin.scores.comparison import MIN_RUNS
+from retwin.scores.uses import RATE
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place
 
@@ -119,8 +119,6 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "anchors": {section.key for section in sections},
         "rate": RATE,
         "docs": DOCS,
-        "corrections": f"{PAGES}corrections.html",
-        "monitor": f"{PAGES}monitor.html",
         "verdict": verdict(study),
     }
 

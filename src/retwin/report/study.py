@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from retwin.errors import InputError
 from retwin.report.labels import order, quantities
 from retwin.results import FidelityResults, Results, read_results
 from retwin.scores.decisions import Decision, decide
+from retwin.scores.uses import uses_of
 from retwin.source_results import SourceResults
 
 AGAIN = "run `retwin study` with this folder as --out again"
@@ -260,4 +261,8 @@ def read_study(folder: str | os.PathLike[str]) -> Study:
             raise InputError(
                 "arrays.npz", expected="arrays of a study", got=f"{path} ({error})", remedy=AGAIN
             ) from error
-    return Study(results, arrays)
+    study = Study(results, arrays)
+    if results.uses:
+        return study
+    # A version that did not state the uses wrote these results.
+    return replace(study, results=results.model_copy(update={"uses": uses_of(results, arrays)}))

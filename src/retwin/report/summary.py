@@ -15,34 +15,23 @@ from retwin.report.blocks import Table, tabulate
 from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, bar, draw_bands
 from retwin.report.labels import (
     behind,
-    in_sentence,
-    latent_names,
     learned_name,
     number,
     percent,
     percents,
     places,
     quantities,
+    quantity,
     source_name,
     span,
 )
-from retwin.report.lights import (
-    Alarms,
-    Light,
-    alarms,
-    better_alternatives,
-    change_of,
-    lights,
-    uses,
-    worst,
-)
-from retwin.report.sections.card import unlike
-from retwin.report.steps import next_steps
 from retwin.report.study import Study
 from retwin.report.style import colour_of
-from retwin.report.verdict import headline, verdict
+from retwin.report.uses import RULE, use_rows
+from retwin.report.verdict import headline
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 from retwin.scores.segments import median_error_trajectory
+from retwin.scores.uses import error_of
 
 MANY_OUTPUTS = 6
 """Number of outputs beyond which one pair of bars stands for all of them."""
@@ -59,35 +48,12 @@ def summary(study: Study) -> dict[str, Any] | None:
     pair = headline(study.results)
     if pair is None:
         return None
-    found = lights(study)
-    chosen: Alarms | None = alarms(study, pair[0]) if study.results.classes else None
-    others, ready = better_alternatives(study, chosen, pair[0]), uses(study, found)
-    best = verdict(study)
     return {
-        "source": pair[0],
-        "plain": pair[1],
-        "lights": found,
-        "uses": ready,
-        "state": worst(each.state for each in found),
-        "light": {each.key: each for each in found},
-        "alternatives": others,
-        "steps": next_steps(study, found, ready, others, best["rival"] if best else None),
+        "rows": use_rows(study.results),
+        "rule": RULE,
         "learned": learned(study),
-        "unlike": _unlike(study, pair[0], found),
-        "warnings": len(study.results.sources[pair[0]].notes),
         "figure": picture(study),
     }
-
-
-def _unlike(study: Study, source: str, found: list[Light]) -> list[str]:
-    """Components of z whose generated values differ, without noise that is missing altogether."""
-    missing = {
-        latent_names(f"noise_{name}")[0]
-        for light in found
-        if light.key == "realism"
-        for name in light.values["noiseless"]
-    }
-    return [in_sentence(name) for name, _ in unlike(study, source) if name not in missing]
 
 
 def learned(study: Study) -> Table | None:
@@ -270,14 +236,19 @@ def _panel(
 
 def _bars(study: Study, pair: tuple[str, str]) -> Panel | None:
     """The error of each output before and after the update."""
-    found = change_of(study)
-    if found is None:
+    measured = error_of(study.results, study.arrays)
+    if measured is None:
         return None
-    change, unit = found
-    before, after = change.outputs_before, change.outputs_after
+    change, given, _ = measured
+    factor, unit = (1.0, "σ") if given == "σ" else quantity(given)
+    before, after = factor * change.outputs_before, factor * change.outputs_after
     names = study.results.outputs.names
     if len(before) > MANY_OUTPUTS or len(before) != len(names):
-        before, after, names = np.array([change.before]), np.array([change.after]), ["all outputs"]
+        before, after, names = (
+            np.array([factor * change.before]),
+            np.array([factor * change.after]),
+            ["all outputs"],
+        )
     marks = [
         bar(place + shift + np.array([0.0, BAR]), np.array([value]), title, colour)
         for values, shift, title, colour in (

@@ -14,8 +14,8 @@ _HOME = homes(
         "calibration": "Reliability calibration_error calibration_floor reliability",
         "change": "ErrorChange error_change",
         "classification": "Scores confusion row_shares score weighted_score",
-        "comparison": "compare_runs compliance holm no_verdict outcome",
-        "decisions": "Cost Decision certain_decision decide detection_difference healthy_needed",
+        "comparison": "compare_runs holm no_verdict outcome",
+        "decisions": "Cost Decision certain_decision decide healthy_needed",
         "distributions": "central_band crps cumulative_counts further_group_quantile "
         "grouped_quantile inside ks_distance log_score pit_histograms quantiles share_as_far",
         "energy": "energy_score",

@@ -7,7 +7,6 @@ adjusted over all pairs, and on the conditions of `no_verdict`.
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
 
@@ -137,33 +136,3 @@ def outcome(interval: tuple[float, float] | None, p: float | None, better: int) 
     if p > SIGNIFICANCE or interval[0] <= 0 <= interval[1]:
         return "open"
     return "better" if (interval[0] > 0) == (better > 0) else "worse"
-
-
-def compliance(
-    value: float, interval: tuple[float, float] | None, low: float, high: float = np.inf
-) -> str:
-    """Whether a value lies in its required range: the one rule of every light on the page.
-
-    Parameters
-    ----------
-    value : float
-        The value, NaN where it was not measured.
-    interval : (float, float)
-        Its confidence interval; None if there is none.
-    low, high : float
-        The ends of the required range.
-
-    Returns
-    -------
-    str
-        "met" if the whole interval lies in the range, "not met" if nothing of it does, "undecided"
-        if a part of it does or there is none, "not measured" without a value.
-
-    """
-    if math.isnan(value):
-        return "not measured"
-    if interval is None:
-        return "undecided"
-    if interval[0] >= low and interval[1] <= high:
-        return "met"
-    return "undecided" if interval[0] <= high and interval[1] >= low else "not met"

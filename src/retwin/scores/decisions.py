@@ -14,8 +14,6 @@ from retwin.scores.intervals import share_interval
 
 TAIL = 0.025
 """The probability beyond each end of an interval."""
-DRAWS = 2000
-"""Bootstrap draws of a difference: they determine its ends to a few hundredths of its width."""
 
 
 @dataclass(frozen=True)
@@ -178,46 +176,6 @@ def certain_decision(
         return None
     rank = min(r for r in range(1, n + 1) if _false_alarms(r, n)[1] <= rate * (1 + 1e-9))
     return decide(probabilities, truth, classes, (n + 1 - rank) / (n + 1))
-
-
-def detection_difference(
-    a: NDArray, b: NDArray, truth: NDArray, classes: list[str], rate: float
-) -> tuple[float, tuple[float, float]] | None:
-    """What one model detects more than another at the same false-alarm rate.
-
-    Parameters
-    ----------
-    a, b : array (n, classes)
-        Predicted probabilities of the two models for the same trajectories.
-    truth, classes, rate
-        See `decide`.
-
-    Returns
-    -------
-    (float, (float, float)) or None
-        The detected share of `a` minus that of `b`, and the 95 % interval of paired draws of the
-        healthy and of the faulty trajectories, so that it contains how uncertain both thresholds
-        are; None where `decide` gives no threshold.
-
-    """
-    healthy = classes.index(HEALTHY)
-    fault = 1 - np.stack([a[:, healthy], b[:, healthy]])
-    reference, faulty = fault[:, truth == healthy], fault[:, truth != healthy]
-    n, m = reference.shape[1], faulty.shape[1]
-    rank = math.ceil((1 - rate) * (n + 1) - 1e-9)
-    if not 1 <= rank <= n or not m:
-        return None
-
-    def difference(rows: NDArray, columns: NDArray) -> float:
-        thresholds = np.sort(reference[:, rows], axis=1)[:, rank - 1]
-        shares = (faulty[:, columns] > thresholds[:, None]).mean(axis=1)
-        return float(shares[0] - shares[1])
-
-    rng = np.random.default_rng(0)
-    rows, columns = (rng.integers(0, size, (DRAWS, size)) for size in (n, m))
-    drawn = [difference(*each) for each in zip(rows, columns, strict=True)]
-    low, high = np.quantile(drawn, [TAIL, 1 - TAIL])
-    return difference(np.arange(n), np.arange(m)), (float(low), float(high))
 
 
 def _false_alarms(rank: int, n: int) -> tuple[float, float]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from retwin.cases.case import Case
 from retwin.checks import nothing, require
 from retwin.data.io import load
 from retwin.data.quality.copies import find_copies
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Report
 from retwin.study.files import Roles
@@ -21,6 +22,8 @@ from retwin.update.corrected import generate
 
 EMULATED_PER_CLASS = 10
 """Emulated trajectories per class where there are no real ones: 90 for the arm, as measured."""
+EMULATED_HEALTHY = 125
+"""Emulated healthy runs, so that each answer on 5 % false alarms can be yes or no."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ def real_data(
         real = read(data.real)
     elif case.emulator is not None:
         seed = plan.seed_of("emulated", 0)
-        real = generate(case.emulator, case, per_class=EMULATED_PER_CLASS, seed=seed)
+        real = _emulated(case, seed)
     else:
         raise InputError(
             "real data",
@@ -124,6 +127,21 @@ def real_data(
     first = _first(real)
     folds = real[first].folds(plan.folds, seed=plan.seed_of("folds", 0))
     return real, Roles.of((first[fit], first[test]) for fit, test in folds)
+
+
+def _emulated(case: Case, seed: int) -> Trajectories:
+    """Few runs of each fault, and enough healthy ones."""
+    first, second = np.random.SeedSequence(seed).spawn(2)
+    seeds = [int(each.generate_state(1)[0]) for each in (first, second)]
+    emulator: Any = case.emulator
+    faulty = generate(emulator, case, per_class=EMULATED_PER_CLASS, seed=seeds[0])
+    if not case.diagnosed:
+        return faulty
+    faulty = faulty[faulty.labels != HEALTHY]
+    only = replace(case, faults={HEALTHY: case.faults[HEALTHY]})
+    return Trajectories.concatenate(
+        [generate(emulator, only, per_class=EMULATED_HEALTHY, seed=seeds[1]), faulty]
+    )
 
 
 def _records(case: Case, path: Path) -> tuple[Trajectories, Trajectories]:

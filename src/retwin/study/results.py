@@ -21,6 +21,7 @@ from retwin.evaluation.fidelity import Fidelity, Overlay
 from retwin.results import SCHEMA, Results
 from retwin.scores.bootstrap import Draws
 from retwin.scores.comparison import MIN_RUNS, compare_runs, holm, no_verdict
+from retwin.scores.uses import uses_of
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import read_about
 from retwin.source_results import CurvePoint, SourceResults
@@ -99,6 +100,7 @@ def write_results(
             **shown,
         }
     )
+    results = results.model_copy(update={"uses": uses_of(results, arrays)})
     with write_atomically(out / "arrays.npz") as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
     with write_atomically(out / "results.json") as part:

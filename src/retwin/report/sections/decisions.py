@@ -3,20 +3,68 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
+from retwin.data.trajectories import HEALTHY
 from retwin.report.blocks import Cell, Section, Table, grouped, tabulate, text_column
 from retwin.report.labels import class_name, distinct, number, percent, percents, source_name
-from retwin.report.lights import RATES, alarms
 from retwin.report.study import Study
 from retwin.report.verdict import headline
-from retwin.scores.decisions import Decision
+from retwin.scores.decisions import Decision, certain_decision, healthy_needed
+from retwin.scores.uses import RATE
 
+RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
+"""False-alarm rates that the page shows."""
 TRAJECTORIES, FAULTY, MISSED = 1000, 0.02, 50
 """The example: trajectories, share of faulty ones, cost of a missed fault in false alarms."""
 GROUP = f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty"
 DETECTED = ("Faults detected", "Detected at the rate", "of these, correct class")
 """Heads of columns."""
+
+
+@dataclass(frozen=True)
+class Alarms:
+    """The decision at the rate that the page chooses.
+
+    Attributes
+    ----------
+    rate : float
+        The chosen false-alarm rate; NaN if the healthy trajectories promise none of `RATES`.
+    decision : Decision
+        None without a rate.
+    certain : bool
+        Whether its false-alarm rate is at most `rate` by its whole interval, or only on average.
+    healthy, needed : int
+        The healthy test trajectories, and how many of them make `rate` certain.
+
+    """
+
+    rate: float
+    decision: Decision | None
+    certain: bool
+    healthy: int
+    needed: int
+
+
+def alarms(study: Study, source: str) -> Alarms | None:
+    """The decision of a source at the rate that the page chooses; None without probabilities.
+
+    A threshold belongs to one model, so it is that of the first run.
+    """
+    classes = study.results.classes
+    if source not in study.diagnosing or HEALTHY not in classes:
+        return None
+    healthy = int(study.healthy.sum())
+    if healthy in (0, len(study.truth)):
+        return None
+    first = study.probabilities(source)[0]
+    for rate in (each for each in RATES if each >= RATE):
+        safe = certain_decision(first, study.truth, classes, rate)
+        found = safe or study.decision(source, rate)
+        if math.isfinite(found.threshold):
+            return Alarms(rate, found, safe is not None, healthy, healthy_needed(rate))
+    return Alarms(math.nan, None, certain=False, healthy=healthy, needed=healthy_needed(RATE))
 
 
 def decisions(study: Study) -> Section | None:

@@ -1,0 +1,122 @@
+"""The four uses as rows of text: the first screen of the page and of the terminal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from retwin.report.labels import behind, counted, number, percent, percents, quantity, source_name
+from retwin.results import Figure, Results, Use
+from retwin.scores.uses import DETECTION, RATE
+
+TITLES = {
+    "simulate": "Simulate",
+    "training": "Generate training data",
+    "diagnose": "Diagnose",
+    "monitor": "Monitor",
+}
+"""Heads of the rows."""
+RULE = (
+    "“Yes” and “no” need the whole 95 % interval within or outside the requirement; “likely” is a "
+    "value within it. The best source by its mean is shown; intervals do not contain that choice."
+)
+"""The one rule, as a sentence."""
+
+
+@dataclass(frozen=True)
+class UseRow:
+    """A row: the use, its answer, its best source, what that reaches, and what is missing."""
+
+    title: str
+    answer: str
+    source: str
+    reached: str
+    missing: str
+
+
+def use_rows(results: Results) -> list[UseRow]:
+    """A row for each use of a study."""
+    return [
+        UseRow(
+            TITLES[use.use],
+            use.answer,
+            source_name(use.source) if use.source else "–",
+            _reached(use),
+            _missing(use, faults=bool(results.classes)),
+        )
+        for use in results.uses
+    ]
+
+
+def _share(it: Figure, runs: str) -> str:
+    """A share with its interval; counts where so few runs decide nothing."""
+    if it.ends is None or it.ends[1] - it.ends[0] > WIDEST:
+        return f"{round(it.value * it.n)} of {it.n}"
+    return f"{percent(it.value)} ({percents(it.ends)})"
+
+
+WIDEST = 0.3
+"""The width of an interval of a share beyond which counts stand in its place."""
+
+
+def _reached(use: Use) -> str:
+    """One or two sentences with intervals, the original twin on the same runs beside."""
+    found, texts = use.figures, []
+    if "error" in found:
+        error, ratio = found["error"], found["ratio"]
+        factor, unit = (1.0, "σ") if error.unit == "σ" else quantity(error.unit)
+        before, after = (behind(number(factor * v), unit) for v in (error.plain, error.value))
+        known = ratio.ends is not None
+        within = f" ({percents(ratio.ends)})" if known else ""
+        texts.append(f"Error {before} → {after}: {percent(ratio.value)}{within} of the original.")
+        if not known:
+            texts.append(f"{counted(ratio.n, 'run')} cannot decide this.")
+    if "macro_f1" in found:
+        score = found["macro_f1"]
+        texts.append(f"Macro-F1 {number(score.value, 2)}; original twin {number(score.plain, 2)}.")
+    if "coverage" in found:
+        band = found["coverage"]
+        texts.append(
+            f"90 % bands contain {percent(band.value)} ({percents(band.ends)}) of samples."
+        )
+    for key, what, runs in (
+        ("called", "Healthy runs called faulty", "healthy run"),
+        ("found", "Faulty runs found", "faulty run"),
+        ("named", "Faults named", "faulty run"),
+    ):
+        if key in found and not (key == "named" and use.use == "training"):
+            it = found[key]
+            texts.append(f"{what}: {_share(it, runs)}; original twin {percent(it.plain)}.")
+    if "detected" in found:
+        it = found["detected"]
+        texts.append(
+            f"With at most {percent(RATE)} false alarms, for certain, faulty runs found: "
+            f"{_share(it, 'faulty run')}; original twin {percent(it.plain)}."
+        )
+    missing = use.missing
+    few = next((found[k] for k in ("alarms", "called") if k in found), None)
+    if few and missing and missing.what == "healthy" and missing.count:
+        texts.append(f"{counted(few.n, 'healthy run')} cannot decide {percent(RATE)}.")
+    joined = " ".join(texts) or "Not measured."
+    return joined[:1].upper() + joined[1:]
+
+
+def _missing(use: Use, *, faults: bool) -> str:
+    it = use.missing
+    if it is None:
+        return "nothing"
+    several = it.count or 0
+    more = {
+        "healthy": f"{several} more healthy run{'s' * (several != 1)}"
+        if several
+        else "healthy runs",
+        "faulty": f"{several} more faulty run{'s' * (several != 1)}" if several else "faulty runs",
+        "records": f"{several} more test record{'s' * (several != 1)}" if several else "records",
+        "test": "more test runs",
+        "runs": f"training it {several} times (give --runs)",
+        "faults": "runs with known faults" if faults else "records with known faults",
+        "classifier": "an updated twin beside the original one",
+        "correction": "another correction",
+        "source": f"a source within {percent(RATE)} false calls and {percent(DETECTION)} of faults",
+        "real": "the same on real measurements",
+    }
+    return more[it.what]
