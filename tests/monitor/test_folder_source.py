@@ -43,6 +43,24 @@ def seconds(gate: CollectingGate) -> list[float]:
     return [each / SECOND for each in gate.order.get("line1", [])]
 
 
+def test_a_folder_of_one_of_two_machines_is_missing_once_and_then_back(tmp_path: Path) -> None:
+    lines: list[str] = []
+    own = settings(tmp_path / "{asset}" / "*.csv")
+    layout = layout_of(own, CHANNELS, None)
+    (tmp_path / "line1").mkdir()
+    gate = CollectingGate()
+    with running(Folder(own, {"line1": layout, "line2": layout}, {}, lines.append), gate):
+        (tmp_path / "line1" / "a.csv").write_text(HEADER + "1,1,1\n")
+        wait(lambda: seconds(gate) == [1], lines)  # the other machine is read
+        time.sleep(0.3)  # ten rounds and more
+        assert len(lines) == 1, lines
+        assert f"there is no folder {tmp_path / 'line2'}" in lines[0]
+        (tmp_path / "line2").mkdir()
+        wait(lambda: len(lines) == 2, lines)
+        time.sleep(0.3)
+    assert [line.rpartition(": ")[2] for line in lines[1:]] == ["back"]
+
+
 @pytest.fixture
 def logs(tmp_path: Path) -> Path:
     (tmp_path / "line1").mkdir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -26,11 +27,13 @@ from retwin.monitor import (
     fit_monitor,
     verify,
 )
+from retwin.monitor.live.explanations import _Turns
 from retwin.monitor.live.layout import Layout
 from retwin.monitor.live.machine import Counts
 from retwin.monitor.live.stream_machine import PLACES, StreamMachine
 from retwin.monitor.program import _offer
 from retwin.monitor.settings import TwinSettings
+from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.updates import Asset, Update
 from retwin.twins import Parameter, ParameterShift, State, StateTwin
 from retwin.update import Dynamics, Library, fit_dynamics
@@ -395,6 +398,29 @@ def test_alarms_are_explained_beside_the_stream_and_after_a_restart(store: Store
     explained = [entry.data["alarm"] for entry in store.log("cause")]
     assert len(explained) > 1
     assert explained == [entry.sequence for entry in store.log("alarm")]
+
+
+def test_machines_take_turns_and_the_newest_event_is_explained_first() -> None:
+    turns = _Turns()
+    backfill = [("a", event, event + alarm) for event in (0, 100, 200) for alarm in (0, 5)]
+    alarms = [*backfill, ("b", 50, 50), ("b", 50, 60)]
+    for number, (asset, event, moment) in enumerate(alarms):
+        data = {"asset": asset, "time": moment, "event": event}
+        turns.put([Entry(number, "alarm", json.dumps(data), "", "")])
+    taken = [turns.get() for _ in range(turns.qsize())]
+    order = [(each[-1].data["asset"], each[-1].data["time"]) for each in taken if each]
+    assert order[:4] == [("a", 200), ("b", 50), ("a", 205), ("b", 60)]
+    assert order[4:] == [("a", 100), ("a", 105), ("a", 0), ("a", 5)]
+
+
+@pytest.mark.parametrize("who", ["", "  "])
+def test_an_alarm_is_acknowledged_by_somebody_with_a_name(store: Store, who: str) -> None:
+    live = opened(store)
+    live.submit([samples(rows(recorded(5, LEAK)))])
+    first = next(iter(store.log("alarm")))
+    with pytest.raises(InputError, match="who: expected who has seen it"):
+        live.acknowledge(first.sequence, who)
+    assert not list(store.log("acknowledge"))
 
 
 def test_a_report_that_fails_and_the_end_leave_no_alarm_waited_for(store: Store) -> None:

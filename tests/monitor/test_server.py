@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import socket
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from urllib.parse import quote
 
 import httpx
@@ -18,6 +20,7 @@ from retwin.errors import InputError
 from retwin.monitor import Registry, verify
 from retwin.monitor.server import create_app, listening
 from retwin.monitor.server.guard import MAX_BODY
+from retwin.monitor.server.serve import HEADERS
 
 pytestmark = pytest.mark.slow
 
@@ -305,6 +308,37 @@ def test_odd_notes_are_stored_or_refused(client: httpx.Client, text: str) -> Non
     answer = client.post(f"/alarms/{alarm['sequence']}/acknowledge", content=body, headers=kind)
     assert answer.status_code in (200, 400, 422)
     assert client.get("/alarms").status_code == 200
+
+
+def test_headers_that_never_end_are_closed_and_what_was_asked_for_is_not(
+    client: httpx.Client, server: Served
+) -> None:
+    host, port = "127.0.0.1", int(server.url.rpartition(":")[2])
+    request = b"GET /assets HTTP/1.1\r\nHost: localhost\r\n"
+    with client.stream("GET", "/events") as events, ExitStack() as opened:
+        lines = (line for line in events.iter_lines() if line)
+        first = next(lines)
+        slow = [opened.enter_context(socket.create_connection((host, port))) for _ in range(3)]
+        slow[1].sendall(request)
+        slow[2].sendall(request + b"\r\n")  # and, after its answer, one that never ends
+        assert slow[2].recv(2**16).startswith(b"HTTP/1.1 200")
+        ends = [0.0] * len(slow)
+        began = time.monotonic()
+        while not all(ends) and time.monotonic() - began < HEADERS + 5:
+            for i, each in enumerate(slow):
+                with suppress(OSError):
+                    each.sendall(b"X" if i else b"")
+                each.settimeout(0.2)
+                with suppress(TimeoutError):
+                    try:
+                        over = not each.recv(2**16)
+                    except ConnectionError:
+                        over = True
+                    if over and not ends[i]:
+                        ends[i] = time.monotonic() - began
+        assert all(0 < each < HEADERS + 2 for each in ends), ends
+        server.send(ASSETS[2], 5, 9)
+        assert next(lines) != first  # an answer that lasts goes on
 
 
 def test_an_answer_does_not_wait_for_an_acknowledgement(client: httpx.Client) -> None:

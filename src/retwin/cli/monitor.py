@@ -444,8 +444,13 @@ def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
     if void:
         text += (
             f"; in {len(void)} of {len(record)} records the promise is VOID, since {min(void):.6g} "
-            "s: the machine is not the one of the calibration. If it is healthy, calibrate with "
-            "this record too"
+            "s: the machine is not the one of the calibration. "
+            + (
+                "Look for the causes of the events first: a calibration with this record would "
+                "take the fault for healthy"
+                if events
+                else "If it is healthy, calibrate with this record too"
+            )
         )
     if watched.outside.any():
         text += (

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from collections.abc import Callable, Container, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -36,10 +37,43 @@ Faults = Callable[[str], "dict[str, Fault | None] | None"]
 """The known faults of a twin by its name; None for any change."""
 
 
+NONE: Mapping[int, dict[str, Any]] = {}
+
+
+class _Turns(queue.Queue["list[Entry] | None"]):
+    """Alarms that wait, each after those that it is explained with; None ends.
+
+    Machines take turns. Of a machine the newest event is first, and its alarms are in their order,
+    since the cause of one depends on those before.
+    """
+
+    def _init(self, maxsize: int) -> None:
+        self._machines: dict[str, dict[int, deque[list[Entry] | None]]] = {}
+
+    def _qsize(self) -> int:
+        return sum(len(each) for events in self._machines.values() for each in events.values())
+
+    def _put(self, item: list[Entry] | None) -> None:
+        alarm = item[-1].data if item else {"asset": "", "time": 0}
+        events = self._machines.setdefault(alarm["asset"], {})
+        events.setdefault(_event(alarm), deque()).append(item)
+
+    def _get(self) -> list[Entry] | None:
+        name = next(iter(self._machines))
+        events = self._machines.pop(name)
+        newest = max(events)
+        item = events[newest].popleft()
+        if not events[newest]:
+            del events[newest]
+        if events:
+            self._machines[name] = events  # behind all others
+        return item
+
+
 class Explanations:
     """A thread that explains each alarm from the stored samples before it.
 
-    A context manager that ends the thread. What is found is an entry `cause` of the log; of further
+    Machines take turns, and of each machine the newest event is explained first. A context manager that ends the thread. What is found is an entry `cause` of the log; of further
     alarms of an event it tells whether the fault is the `same`, see `find_cause`. Alarms that have
     none, since the program was stopped, are explained when it is started again.
 
@@ -64,16 +98,14 @@ class Explanations:
         self._live = live
         self._faults = faults
         self._report = report
-        self._queue: queue.Queue[list[Entry] | None] = queue.Queue()
+        self._queue = _Turns()
         self._alarms: dict[str, list[Entry]] = {}
-        self._current: dict[str, dict[str, Any]] = {}
+        self._current: dict[tuple[str, int], str] = {}
+        """The cause of each event, by its machine and time."""
         self._closed = threading.Event()
         self._taking = threading.Lock()
         self._last = -1
-        explained = set()
-        for entry in live.store.log("cause"):
-            explained.add(entry.data["alarm"])
-            self._keep(entry.data)
+        explained = {entry.data["alarm"]: entry.data for entry in live.store.log("cause")}
         with self._taking:  # alarms that are raised meanwhile are taken after the earlier ones
             live.listen(self._on_entries)
             self._take(live.store.log("alarm"), explained)
@@ -109,24 +141,26 @@ class Explanations:
             with self._taking:
                 self._take(each for each in alarms if each.sequence > self._last)
 
-    def _take(self, alarms: Iterable[Entry], explained: Container[int] = ()) -> None:
+    def _take(self, alarms: Iterable[Entry], explained: Mapping[int, dict[str, Any]] = NONE) -> None:
         """Queue alarms, each after the first and the newest of its event, or those before it."""
         for entry in alarms:
             asset = entry.data["asset"]
             known = self._alarms.get(asset, [])
             if known and known[0].data.get("version") != entry.data.get("version"):
                 known = []
-            if entry.sequence not in explained and "cause" not in entry.data:
+            if entry.sequence in explained:
+                self._keep(entry, explained[entry.sequence])
+            elif "cause" not in entry.data:
                 self._queue.put([*known, entry])
             same = known and _event(known[0].data) == _event(entry.data)
             newest = known[1:][-MIN_WINDOW:]
             self._alarms[asset] = [*known[:1], *newest, entry] if same else [entry]
             self._last = entry.sequence
 
-    def _keep(self, cause: dict[str, Any]) -> None:
-        """Keep what the newest event of a machine is explained by."""
+    def _keep(self, alarm: Entry, cause: dict[str, Any]) -> None:
+        """Keep what the event of an alarm is explained by."""
         if not cause.get("same"):
-            self._current[cause["asset"]] = cause
+            self._current[alarm.data["asset"], _event(alarm.data)] = cause["name"]
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -149,7 +183,7 @@ class Explanations:
             found = cause_data(UNKNOWN, 0.0, 1.0, {}) | {"note": brief(error), "same": same}
         found |= {"alarm": entry.sequence, "asset": alarm["asset"]}
         self._live.log([("cause", found)])
-        self._keep(found)
+        self._keep(entry, found)
         try:
             self._report(alarm, found)
         except Exception:  # of the caller; further alarms are explained all the same
@@ -176,8 +210,7 @@ class Explanations:
         record = record_of(monitor.twin, values)
         *earlier, newest = [_alarm(each.data, int(times[0]), period) for each in entries]
         alarms = [*earlier, replace(newest, sample=record.steps - 1)]
-        cause = self._current.get(name, {"alarm": -1})
-        current = cause["name"] if cause["alarm"] >= entries[0].sequence else ""
+        current = self._current.get((name, _event(last)), "")
         known = self.causes(twin, monitor)
         found = find_cause(monitor.twin, record, alarms, known, current=current, known_start=False)
         return found, int(times[0])

@@ -210,9 +210,11 @@ class Live:
         Raises
         ------
         InputError
-            There is no such alarm.
+            There is no such alarm, or nobody is named.
 
         """
+        remedy = "give a name, which the log keeps"
+        require(who.strip(), "who", expected="who has seen it", got=repr(who), remedy=remedy)
         after = whole("sequence", sequence, least=0) - 1
         entry = next(iter(self.store.log("alarm", after=after)), None)
         require(

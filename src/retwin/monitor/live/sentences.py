@@ -8,7 +8,10 @@ from retwin.monitor.models.cause import cause_text, cause_title
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.samples import SECOND
 
-REMEDY = "If it is healthy, recalibrate: what follows are remarks, and no alarms, until then"
+REMEDY = (
+    "Look for a fault first. Only if it is healthy, recalibrate: until then what follows are "
+    "remarks, and no alarms"
+)
 """What to do where a promise is void."""
 
 

@@ -2,19 +2,62 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from retwin.checks import needs_extra
 from retwin.errors import InputError, brief
 from retwin.monitor.server.guard import RequestGuard
 
+if TYPE_CHECKING:
+    import uvicorn
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+else:
+    uvicorn = needs_extra("uvicorn", "monitor", "serves the monitor's page")
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
 PORT = 8710
 """The port unless another one is given."""
 PATIENCE = 3
 """Seconds for which requests are finished at the end."""
+HEADERS = 10.0
+"""Seconds within which the headers of a request have to end, or its connection is closed: each one
+counts towards those that are served at the same time, and no token was asked for yet."""
+
+
+class _Protocol(H11Protocol):
+    """A connection that is closed where a request does not begin in time.
+
+    The server itself bounds the pause before the first byte of a further request alone.
+    """
+
+    _deadline: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._expect()
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self._expect(ended=True)
+        super().connection_lost(error)
+
+    def on_response_complete(self) -> None:
+        self._expect()
+        super().on_response_complete()
+
+    def _expect(self, *, ended: bool = False) -> None:
+        """Close the connection later, unless another request than the present one has begun."""
+        before = self.cycle
+        if self._deadline is not None:
+            self._deadline.cancel()
+        if not ended:
+            self._deadline = self.loop.call_later(
+                HEADERS, lambda: self.cycle is before and self.transport.close()
+            )
 
 
 def listening(host: str, port: int) -> socket.socket:
@@ -47,9 +90,9 @@ def serving(app: RequestGuard, bound: socket.socket) -> Iterator[None]:
 
     The socket is one of `listening`.
     """
-    uvicorn = needs_extra("uvicorn", "monitor", "serves the monitor's page")
     config = uvicorn.Config(
         app,
+        http=_Protocol,
         log_level="warning",
         lifespan="off",
         access_log=False,

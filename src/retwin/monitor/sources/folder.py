@@ -56,20 +56,30 @@ class Files(Source):
     def run(self, gate: Gate, stop: threading.Event) -> None:
         """Read the files again and again, until `stop` is set."""
         while not stop.is_set():
-            for asset in self._assets:
-                pattern = self._settings.files.replace("{asset}", glob.escape(asset))
-                parts = Path(pattern).parts[:-1]
-                base = Path(*takewhile(lambda part: not glob.has_magic(part), parts))
-                if base.is_dir():
-                    self.back()
+            patterns = {
+                asset: self._settings.files.replace("{asset}", glob.escape(asset))
+                for asset in self._assets
+            }
+            bases = {asset: _base(pattern) for asset, pattern in patterns.items()}
+            missing = sorted({str(base) for base in bases.values() if not base.is_dir()})
+            if missing:
+                self.lost(f"there is no folder {', '.join(missing)}")
+            else:
+                self.back()
+            for asset, pattern in patterns.items():
+                if str(bases[asset]) not in missing:
                     self._read(asset, sorted(glob.glob(pattern, recursive=True)), gate, stop)
-                else:
-                    self.lost(f"there is no folder {base}")
             stop.wait(self._settings.every)
 
     @abstractmethod
     def _read(self, asset: str, paths: list[str], gate: Gate, stop: threading.Event) -> None:
         """Send what is new in the files of a machine."""
+
+
+def _base(pattern: str) -> Path:
+    """The folder of a pattern, as far as its name is no pattern."""
+    parts = Path(pattern).parts[:-1]
+    return Path(*takewhile(lambda part: not glob.has_magic(part), parts))
 
 
 class Folder(Files):
