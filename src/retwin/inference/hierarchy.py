@@ -352,7 +352,6 @@ class Hierarchy:
         self, design: Design, found: _Posterior, rng: np.random.Generator
     ) -> Hierarchy:
         """Variances from their distribution for a β and an x that are drawn."""
-
         beta = found.draw_coefficients(rng)
         noise = normal(found.origin, rng)[..., None]
         noise = torch.linalg.solve_triangular(found.factor.mT, noise, upper=True)[..., 0]
@@ -413,9 +412,7 @@ class Hierarchy:
         relative = _scaled(sums + FREEDOM * expected, counts + FREEDOM, rng).clamp_max(LARGEST**2)
         return replace(self, variance=variance, common=common, relative=relative)
 
-    def _usual(
-        self, design: Design, before: Tensor, rng: np.random.Generator | None
-    ) -> Variances:
+    def _usual(self, design: Design, before: Tensor, rng: np.random.Generator | None) -> Variances:
         """What variances (G,) are expected to be if nothing but their units is known."""
         first, last = design.tied
         expected = design.unit.square().clone()

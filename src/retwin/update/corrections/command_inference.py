@@ -9,7 +9,6 @@ Whether an actuator missed a segment is decided by comparing evidence.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -61,8 +60,8 @@ FIRST_JITTER = 1 / 35
 SMALLEST_SHARE = 0.1
 """Smallest share of the samples that is taken to be left after z* has been fitted to them."""
 PREDICTED = 20
-"""Further runs that are predicted: as many trajectories as a residual model is calibrated on."""
-ALWAYS = bool(int(os.environ.get("RETWIN_ALWAYS", "0")))
+"""Runs, measured and predicted, from which a distribution is learned: as many trajectories as a
+residual model is calibrated on. Of fewer, the hyperparameters' posterior predicts the rest."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -152,10 +151,8 @@ def infer_commands(
     design = constant.features.design(problem)
     draws = constant.hierarchy.draws(design, certain or likelihood)
     shown = machine(draws, problem.missed, problem.healthy, context.rate)
-    made = replace(made, learned=shown)
-    if others is not None or ALWAYS:
-        made = replace(made, predicted=_predicted(problem, design, draws, learned.missed))
-    return made, learned
+    predicted = _predict_runs(problem, design, draws, learned.missed)
+    return replace(made, learned=shown, predicted=predicted), learned
 
 
 def _require_samples(mask: Tensor) -> None:
@@ -410,28 +407,33 @@ def _odds(problem: CommandProblem, assumed: tuple[float, float]) -> Tensor:
     return ((missed + assumed[0]) / (problem.healthy.sum() + assumed[1])).logit()
 
 
-def _predicted(
+def _predict_runs(
     problem: CommandProblem,
     design: Design,
     draws: Sequence[Hierarchy],
     assumed: tuple[float, float],
-) -> Tensor:
-    """Draws (J, M, 1 + 2 d_u) of z in further runs, under conditions that were not seen."""
-    rng, made = np.random.default_rng(2), []
+) -> Tensor | None:
+    """Draws (J, M, 1 + 2 d_u) of z in further runs, under conditions that were not seen.
+
+    None from enough runs.
+    """
+    further = PREDICTED - len(problem)
+    if further <= 0:
+        return None
+    rng, runs = np.random.default_rng(2), []
     missed = float((problem.missed * problem.healthy).sum()) + assumed[0]
-    rest = float(problem.healthy.sum()) + assumed[1] - missed
+    moved = float(problem.healthy.sum()) + assumed[1] - missed
     common = _common(problem)
     features = torch.where(design.kind == CONDITION, 0.0, design.features)
-    for j in range(PREDICTED):
-        row, one = j % len(problem), draws[j * len(draws) // PREDICTED]
-        mean = features[row] @ one.coefficients
-        x = mean + one.total()[design.group].sqrt() * normal(mean, rng)
+    for j in range(further):
+        row, drawn = j % len(problem), draws[j * len(draws) // further]
+        mean = features[row] @ drawn.coefficients
+        x = mean + drawn.total()[design.group].sqrt() * normal(mean, rng)
         z = (common[row] @ x.view(len(common[row]), -1, 1))[..., 0]
         z[..., 0].clamp_(*problem.delay_range)
-        share = rng.beta(missed, max(rest, assumed[0]))
-        events = rng.random(problem.missed.shape[1:]) < share
-        made.append(torch.cat([z, torch.from_numpy(events).to(z)], dim=-1))
-    return torch.stack(made)
+        events = rng.random(problem.missed.shape[1:]) < rng.beta(missed, max(moved, assumed[0]))
+        runs.append(torch.cat([z, torch.from_numpy(events).to(z)], dim=-1))
+    return torch.stack(runs)
 
 
 def _common(problem: CommandProblem) -> Tensor:

@@ -81,6 +81,11 @@ class OtherMachines:
     values: Mapping[str, tuple[NDArray, NDArray]]
     missed: tuple[float, float]
 
+    @property
+    def text(self) -> str:
+        """Where the prior came from."""
+        return f"prior from {self.count} other machine{'s' * (self.count > 1)}"
+
     @classmethod
     def of(cls, machines: Sequence[Mapping[str, Any]]) -> OtherMachines:
         """That of a machine like these, of each what `learned` gave."""
@@ -88,7 +93,7 @@ class OtherMachines:
         values = {}
         for kind in sorted(kinds):
             shown = np.array([each[kind] for each in machines if kind in each])
-            values[kind] = _predict(*np.moveaxis(shown, -1, 0), kind)
+            values[kind] = _predict(shown[..., 0], shown[..., 1], kind)
         missed, all_ = np.sum([each["missed"][0] for each in machines], axis=0) + MISSED
         strength = MISSED[1] * len(machines)
         return cls(len(machines), values, (float(strength * missed / all_), strength))

@@ -244,8 +244,7 @@ def fit_residual(
     onsets = Segments.from_commands(calibration.commands)
     model.timing = np.where(onsets.valid, onsets.start, np.nan)
     model.emulated, model.learned = used.emulated, found.learned
-    model.machines = 0 if others is None else others.count
-    return _noted(model.eval(), outside, missing)
+    return _noted(model.eval(), outside, missing, "" if others is None else others.text)
 
 
 def _segmented(
@@ -306,12 +305,16 @@ def _fit_per_segment(
     return replace(result, figures=figures | result.figures)
 
 
-def _noted(model: R, outside: str, missing: str) -> R:
+def _noted(model: R, outside: str, missing: str, prior: str = "") -> R:
     """The model; its record states the commands that the surrogate was not trained on.
 
-    It also states in which trajectories nothing was measured.
+    It also states in which trajectories nothing was measured, and where its prior came from.
     """
-    notes = [f"commands outside the surrogate's training: {outside}" if outside else "", missing]
+    notes = [
+        f"commands outside the surrogate's training: {outside}" if outside else "",
+        missing,
+        prior,
+    ]
     if model.fitted is not None:
         reason = "; ".join(filter(None, [model.fitted.reason, *notes]))
         model.fitted = replace(model.fitted, reason=reason)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from retwin.checks import require
+from retwin.checks import agree, given, instance, require
 from retwin.data.trajectories import Channels
 from retwin.update.corrections import CommandSpace, Correction, before_sensor
 from retwin.update.corrections.machines import OtherMachines
@@ -49,8 +49,10 @@ def other_machines(
     if prior is None:
         return None
     several = isinstance(prior, Sequence) and not isinstance(prior, str)
-    given: Sequence[Prior] = prior if several else [prior]  # type: ignore[assignment, list-item]
-    require(len(given), "prior", expected="models of other machines", got="none", remedy="name one")
+    models: Sequence[Prior] = prior if several else [prior]  # type: ignore[assignment, list-item]
+    require(
+        len(models), "prior", expected="models of other machines", got="none", remedy="name one"
+    )
     operator = before_sensor(correction)
     require(
         isinstance(operator, CommandSpace),
@@ -60,7 +62,7 @@ def other_machines(
         remedy="leave the prior out, or correct in command space",
     )
     shown = []
-    for each in given:
+    for each in models:
         model, name = _residual(each)
         require(
             type(before_sensor(model.correction)) is type(operator),
@@ -69,23 +71,19 @@ def other_machines(
             got=f"{type(before_sensor(model.correction)).__name__} in {name}",
             remedy="leave it out",
         )
-        for what in ("inputs", "outputs"):
-            own, other = getattr(system, what), getattr(model, what)
-            require(
-                own == other,
-                "prior",
-                expected=f"models with the {what} {own}",
-                got=f"{other} in {name}",
-                remedy="name models of machines of this kind",
-            )
-        require(
-            model.learned is not None,
-            "prior",
-            expected="models that state what their machine has shown",
-            got=f"none in {name}",
-            remedy="fit it again with this version",
+        remedy = f"leave {name} out: it is no machine of this kind"
+        agree(
+            "prior", model, system, "those of the twin", names=("inputs", "outputs"), remedy=remedy
         )
-        shown.append(model.learned)
+        shown.append(
+            given(
+                "prior",
+                model.learned,
+                "models that state what their machine has shown",
+                got=f"none in {name}",
+                remedy="fit it again with this version",
+            )
+        )
     return OtherMachines.of(shown)
 
 
@@ -94,12 +92,6 @@ def _residual(prior: Prior) -> tuple[Residual[Any], str]:
     if isinstance(prior, str | Path):
         inside = Path(prior) / "residual"
         return load_residual(inside if inside.is_dir() else prior), str(prior)
-    model = getattr(prior, "residual", prior)
-    require(
-        isinstance(model, Residual),
-        "prior",
-        expected="a residual model, a corrected twin, or the folder of one",
-        got=type(prior).__name__,
-        remedy="fit it with fit_residual",
-    )
-    return model, type(prior).__name__
+    model, name = getattr(prior, "residual", prior), type(prior).__name__
+    remedy = "give a residual model, a corrected twin, or the folder of one"
+    return instance("prior", model, Residual, remedy=remedy), name  # type: ignore[type-abstract]

@@ -65,8 +65,6 @@ class Residual(nn.Module, ABC, Generic[D]):
     learned : dict or None
         What the machine has shown to others of its kind, see `corrections.machines`; None where the
         correction learns nothing of that kind.
-    machines : int
-        The number of other machines from which its prior came.
 
     """
 
@@ -97,7 +95,6 @@ class Residual(nn.Module, ABC, Generic[D]):
         self.timing: NDArray = np.empty((0, 0))
         self.fitted: Fit | None = None
         self.learned: Learned | None = None
-        self.machines = 0
         self.bounds = nn.Buffer(torch.ones(len(self.latent)))
         self.shift = nn.Buffer(torch.ones(len(self.latent)))
         self.scale = nn.Buffer(torch.ones(len(self.latent)))
@@ -164,7 +161,6 @@ class Residual(nn.Module, ABC, Generic[D]):
             "timing": [[None if np.isnan(t) else t for t in row] for row in self.timing],
             "fitted": None if self.fitted is None else asdict(self.fitted),
             "learned": self.learned,
-            "machines": self.machines,
         }
         save_model(folder, self.kind, about, self.state_dict())
 
@@ -190,7 +186,7 @@ class Residual(nn.Module, ABC, Generic[D]):
         model.emulated = about["emulated"]
         model.timing = np.atleast_2d(np.array(about["timing"], dtype=float))
         model.fitted = Fit.of(about["fitted"])
-        model.learned, model.machines = about.get("learned"), about.get("machines", 0)
+        model.learned = about.get("learned")
         return model.eval()
 
 
