@@ -13,6 +13,7 @@ import pytest
         ("study no/case.toml --out made", "CASE"),
         ("fit armpi --real no.mat --out made", "--real"),
         ("fit armpi --real no.mat --out m", "--real"),
+        ("fit armpi --real no.mat --prior no --out m", "--prior"),
         ("data info no.mat", "FILES"),
         ("data convert no.mat made.npz", "IN"),
         ("twin simulate armpi --commands no.npz --out made.npz", "--commands"),

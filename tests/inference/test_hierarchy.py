@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from retwin.inference.hierarchy import CONDITION, Design, Hierarchy, Likelihood
+from retwin.inference.hyperprior import Hyperprior
 from retwin.inference.solver import Solution
 
 pytestmark = pytest.mark.numerical
@@ -156,7 +157,9 @@ def test_unused_variables_do_not_count() -> None:
 def test_variances_that_nothing_shows_stay_within_their_prior() -> None:
     """Standard deviations are half-normal beforehand, about one unit: they cannot drift away."""
     data = drawn(10, seed=6)
-    first = Hierarchy.of(data.design, torch.ones(2).double(), torch.zeros(4).double(), (1.0, 4.0))
+    first = Hierarchy.of(
+        data.design, torch.ones(2).double(), torch.zeros(4).double(), Hyperprior((1.0, 4.0))
+    )
     nothing = Likelihood(
         torch.zeros(10, 4, 4).double(), torch.zeros_like(data.x), torch.zeros_like(data.x)
     )
@@ -246,7 +249,9 @@ def test_replicates_tell_nothing_of_what_none_of_them_shows() -> None:
 def test_evidence_is_that_of_the_outputs() -> None:
     """The difference of two log evidences is that of the densities of what is measured."""
     data = drawn(12, seed=4)
-    first = Hierarchy.of(data.design, torch.ones(2).double(), torch.zeros(4).double(), (1.0, 4.0))
+    first = Hierarchy.of(
+        data.design, torch.ones(2).double(), torch.zeros(4).double(), Hyperprior((1.0, 4.0))
+    )
     given, found = likelihood(data, first), []
     for scale in (1.0, 3.0):
         hierarchy = replace(first, variance=scale * first.variance, relative=scale * first.relative)

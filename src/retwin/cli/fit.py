@@ -53,6 +53,9 @@ Density = Annotated[
     str | None,
     rare("NAME", "mixture, flow or sequence_mixture.", names=catalog.DENSITIES),
 ]
+Prior = Annotated[
+    list[Path] | None, option("FOLDER", "A model of another such machine; may be repeated.")
+]
 Refine = Annotated[bool, rare("", "Fine-tune on outputs afterwards.", "--refine")]
 
 
@@ -63,6 +66,7 @@ def fit(
     horizon: Horizon = "free",
     dynamics: StateEquations = False,
     correction: Correction = None,
+    prior: Prior = None,
     mapping: LogMapping = None,
     seed: Seed = 0,
     as_json: Json = False,
@@ -85,6 +89,7 @@ def fit(
     import retwin as rt
     from retwin.evaluation.choice.surrogates import SurrogateSettings
     from retwin.update.residual.fitting import calibrating
+    from retwin.update.residual.priors import other_machines
 
     holds = ("model.json", "weights.safetensors", "surrogate", "residual", "choice.json")
     check_place(out, folder=True, holds=(*holds, "report.html"))
@@ -98,6 +103,7 @@ def fit(
         remedy="state equations are corrected alone, by healthy records",
     )
     system = _system(case, network, correction, density, refine, simulations)
+    other_machines(prior, system.correction, system.twin)
     measured = read(real, system, part="calibration", max_bytes=max_bytes, mapping=mapping)
     measured = _labelled(system, measured)
     faults = system.faults if calibrate_on == "all" else calibrate_on
@@ -130,6 +136,7 @@ def fit(
         method=method,
         compare=compare,
         calibrate_on=faults,
+        prior=prior,
     )
     # The path is absolute, since a model is also used from other folders.
     name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case

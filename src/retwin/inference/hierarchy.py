@@ -15,12 +15,14 @@ Bayesian Anal. 1, 515, 2006): what outputs leave open depends on their ratios.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from retwin.inference.hyperprior import Hyperprior, Variances
 from retwin.inference.priors import ROUNDING, GaussianPrior, inverse
 from retwin.inference.solver import Solution
 
@@ -148,6 +150,11 @@ class _Posterior:
     uncertain: Tensor
     evidence: Tensor
 
+    def draw_coefficients(self, rng: np.random.Generator) -> Tensor:
+        """A draw (F,) of β."""
+        values, vectors = torch.linalg.eigh(self.uncertain)
+        return self.beta + vectors @ (values.clamp_min(0).sqrt() * normal(values, rng))
+
 
 @dataclass(frozen=True, eq=False)
 class Hierarchy:
@@ -165,8 +172,8 @@ class Hierarchy:
         (F,), posterior mean.
     covariance : Tensor
         (F, F), posterior covariance of the coefficients.
-    flat : tuple of float
-        Mean and variance of the prior of coefficients of kind 0, infinite if nothing is known.
+    expected : Hyperprior
+        What is expected of the coefficients of kind 0 and of the variances.
 
     """
 
@@ -175,7 +182,7 @@ class Hierarchy:
     relative: Tensor
     coefficients: Tensor
     covariance: Tensor
-    flat: tuple[float, float] = (0.0, torch.inf)
+    expected: Hyperprior = Hyperprior()  # noqa: RUF009 - frozen
 
     @classmethod
     def of(
@@ -183,21 +190,21 @@ class Hierarchy:
         design: Design,
         variance: Tensor,
         coefficients: Tensor,
-        flat: tuple[float, float] = (0.0, torch.inf),
+        expected: Hyperprior = Hyperprior(),  # noqa: B008 - frozen
     ) -> Hierarchy:
         """The hyperparameters to begin with: variances (G,), certain coefficients (F,)."""
         count = len(coefficients)
         common = variance * float((design.kind == CONDITION).any())
         level = _level(design, variance)
         certain = variance.new_zeros(count, count)
-        return cls(variance, common, design.share * level, coefficients, certain, flat)
+        return cls(variance, common, design.share * level, coefficients, certain, expected)
 
     def adapted(self, design: Design) -> Hierarchy:
         """The same variances of errors to begin with for another regression."""
         coefficients = self.variance.new_zeros(len(design.owner))
         flat = design.kind == FLAT
         coefficients[flat] = self.coefficients[: int(flat.sum())]
-        made = Hierarchy.of(design, self.total(), coefficients, self.flat)
+        made = Hierarchy.of(design, self.total(), coefficients, self.expected)
         return replace(made, variance=self.variance, common=self.common)
 
     def prior(self, design: Design) -> GaussianPrior:
@@ -248,20 +255,35 @@ class Hierarchy:
         Variances are those of `learned_from`, if it is another likelihood than that of x (a cut
         posterior: Plummer, Stat. Comput. 25, 37, 2015).
         """
-        rng = np.random.default_rng(0)
-        means, covariances, given = [], [], self
-        for count in range(WARM_UP + DRAWS):
-            drawn = found = given._posterior(design, learned_from or likelihood)
-            if count >= WARM_UP:
-                if learned_from is not None:
-                    found = given._posterior(design, likelihood)
-                means.append(found.origin + found.moved @ found.beta)
-                spread = found.moved @ found.uncertain @ found.moved.mT
-                covariances.append(found.covariance + spread)
-            given = given._draw_variances(design, drawn, rng)
+        means, covariances = [], []
+        for given, drawn in self._sample(design, learned_from or likelihood):
+            found = drawn if learned_from is None else given._posterior(design, likelihood)
+            means.append(found.origin + found.moved @ found.beta)
+            spread = found.moved @ found.uncertain @ found.moved.mT
+            covariances.append(found.covariance + spread)
         mean = torch.stack(means).mean(dim=0)
         away = torch.stack(means, dim=1) - mean[:, None]
         return mean, torch.stack(covariances).mean(dim=0) + away.mT @ away / DRAWS
+
+    def draws(self, design: Design, likelihood: Likelihood) -> list[Hierarchy]:
+        """Hyperparameters from their posterior: variances, and coefficients that are certain."""
+        rng, made = np.random.default_rng(1), []
+        for given, found in self._sample(design, likelihood):
+            beta = found.draw_coefficients(rng)
+            certain = torch.zeros_like(found.uncertain)
+            made.append(replace(given, coefficients=beta, covariance=certain))
+        return made
+
+    def _sample(
+        self, design: Design, likelihood: Likelihood
+    ) -> Iterator[tuple[Hierarchy, _Posterior]]:
+        """`DRAWS` draws of the variances, by Gibbs sampling, and the posterior for each."""
+        rng, given = np.random.default_rng(0), self
+        for count in range(WARM_UP + DRAWS):
+            found = given._posterior(design, likelihood)
+            if count >= WARM_UP:
+                yield given, found
+            given = given._draw_variances(design, found, rng)
 
     def _variances(self, design: Design) -> Tensor:
         own, effect = self.variance[design.group], self.common[design.group]
@@ -287,9 +309,9 @@ class Hierarchy:
         # With x integrated out, β has this precision, and the errors ε depend on β by -left.
         moved = covariance @ weighted
         own = self.relative[design.kind.clamp_min(0)] * design.unit[design.owner].square()
-        own = torch.where(design.kind == FLAT, self.flat[1], own)
         own = torch.where(design.kind == CONDITION, self.common[design.owner], own)
-        centre = torch.where(design.kind == FLAT, self.flat[0], torch.zeros_like(own))
+        flat, centre = design.kind == FLAT, torch.zeros_like(own)
+        centre[flat], own[flat] = (torch.as_tensor(each).to(own) for each in self.expected.flat)
         information = (weighted.mT @ (features - moved)).sum(dim=0) + torch.diag(own.reciprocal())
         # Where nothing is measured, nothing is known of coefficients that are not shrunk.
         known = (weighted * features).sum(dim=(0, 1))  # of each coefficient, were x measured
@@ -330,19 +352,14 @@ class Hierarchy:
         self, design: Design, found: _Posterior, rng: np.random.Generator
     ) -> Hierarchy:
         """Variances from their distribution for a β and an x that are drawn."""
-
-        def normal(like: Tensor) -> Tensor:
-            return torch.from_numpy(rng.standard_normal(tuple(like.shape)))
-
-        values, vectors = torch.linalg.eigh(found.uncertain)
-        beta = found.beta + vectors @ (values.clamp_min(0).sqrt() * normal(values))
-        noise = normal(found.origin)[..., None]
+        beta = found.draw_coefficients(rng)
+        noise = normal(found.origin, rng)[..., None]
         noise = torch.linalg.solve_triangular(found.factor.mT, noise, upper=True)[..., 0]
         x = found.origin + found.moved @ beta + self._variances(design).sqrt() * noise
         error = (x - design.features @ beta) / design.wider
         own, effect = self._parts(design)
         both = own * effect * self.total()[design.group]
-        part = effect * error + both.sqrt() * normal(error)
+        part = effect * error + both.sqrt() * normal(error, rng)
         return self._update_variances(
             design, (error - part).square(), part.square(), beta.square(), rng
         )
@@ -369,7 +386,11 @@ class Hierarchy:
             return zero.index_add(0, design.group, values.sum(dim=0))
 
         variance = self._variance(
-            design, sum_by_group(error * used), sum_by_group(used), self.variance, rng
+            design,
+            sum_by_group(error * used),
+            sum_by_group(used),
+            self.expected.error or self._usual(design, self.variance, rng),
+            rng,
         )
         total, count = sum_by_group(effect * single), sum_by_group(single)
         shown = ((design.features * used[..., None]).abs().sum(dim=(0, 1)) > 0).to(beta)
@@ -378,7 +399,8 @@ class Hierarchy:
         count = count.index_add(0, design.owner, shown)
         common = self.common
         if (design.kind == CONDITION).any():
-            common = self._variance(design, total, count, self.common, rng)
+            usual = self.expected.effect or self._usual(design, self.common, rng)
+            common = self._variance(design, total, count, usual, rng)
         some = design.kind != CONDITION
         kind, owner = design.kind[some], design.owner[some]
         share = beta[some] / design.unit[owner].square()
@@ -390,20 +412,29 @@ class Hierarchy:
         relative = _scaled(sums + FREEDOM * expected, counts + FREEDOM, rng).clamp_max(LARGEST**2)
         return replace(self, variance=variance, common=common, relative=relative)
 
+    def _usual(self, design: Design, before: Tensor, rng: np.random.Generator | None) -> Variances:
+        """What variances (G,) are expected to be if nothing but their units is known."""
+        first, last = design.tied
+        expected = design.unit.square().clone()
+        expected[first:last] *= _level(design, before, rng)
+        return Variances(expected, torch.full_like(expected, FREEDOM))
+
     def _variance(
         self,
         design: Design,
         total: Tensor,
         count: Tensor,
-        before: Tensor,
+        usual: Variances,
         rng: np.random.Generator | None,
     ) -> Tensor:
         """Variances (G,) of which sums of squares and numbers of values are known."""
-        first, last = design.tied
-        expected = design.unit.square().clone()
-        expected[first:last] *= _level(design, before, rng)
-        found = _scaled(total + FREEDOM * expected, count + FREEDOM, rng)
+        found = _scaled(total + usual.count * usual.expected, count + usual.count, rng)
         return found.minimum((LARGEST * design.unit).square())
+
+
+def normal(like: Tensor, rng: np.random.Generator) -> Tensor:
+    """Draws from the standard normal distribution, as many as `like` has values."""
+    return torch.from_numpy(rng.standard_normal(tuple(like.shape)))
 
 
 def _scaled(total: Tensor, count: Tensor, rng: np.random.Generator | None) -> Tensor:

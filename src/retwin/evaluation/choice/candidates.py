@@ -137,6 +137,7 @@ class Candidates:
         return self._corrected(twin, Additive(), StationaryNoise())
 
     def _corrected(self, twin: Twin, correction: Correction, density: object) -> CorrectedTwin:
+        learns = correction is self.settings.correction  # what machines have in common
         residual = fit_residual(
             twin,
             self.records,
@@ -145,6 +146,7 @@ class Candidates:
             seed=self.seed,
             calibrate_on=self.settings.calibrate_on,
             twin=self.original,
+            prior=self.settings.prior if learns else None,
             progress=self.progress,
         )
         return CorrectedTwin(twin, residual, self.case)  # type: ignore[arg-type]

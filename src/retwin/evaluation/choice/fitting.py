@@ -32,7 +32,8 @@ from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.agreement import check_with_twin
 from retwin.update.blackbox import BLACK_BOXES, fit_black_box
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.corrections import Additive
+from retwin.update.corrections import Additive, DelayOffset
+from retwin.update.corrections.machines import OtherMachines
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.forecast_errors import ForecastErrors
@@ -44,6 +45,7 @@ from retwin.update.forecasts import (
     free_moments,
 )
 from retwin.update.residual.fitting import calibrating
+from retwin.update.residual.priors import other_machines
 from retwin.workers.threads import one_thread
 
 UNSTABLE = (
@@ -106,15 +108,17 @@ def fit(
     began, given_records = time.perf_counter(), records
     records = _select_records(records, settings)
     check_channels(twin, records, "records")
+    others = other_machines(settings.prior, settings.correction or DelayOffset(), twin)
     checked = check_with_twin(original or twin, given_records)
-    alone = None if settings.compared else progress
-    whole = Candidates(twin, records, settings, seed, case, original, alone)
+    shown = None if settings.compared else progress
+    whole = Candidates(twin, records, settings, seed, case, original, shown)
     names = _names(whole, settings)
     since = time.process_time()
     # First, so that settings of a given method that are wrong are so before the comparison.
     given = whole.fits[settings.method]() if settings.method else None
     if given is not None and not settings.compared:
-        return _fit_alone(whole, given, time.process_time() - since, began, checked)
+        alone = _fit_alone(whole, given, time.process_time() - since, began, checked)
+        return replace(alone, remarks=(*alone.remarks, *_of_prior(given, others)))
     folds = folds_of(records)
     trials = _run_trials(whole, folds, names, progress)
     comparison, reasons = trials.compare(settings.horizon)
@@ -145,7 +149,7 @@ def fit(
         chosen=chosen,
         preferred=preferred,
         scores=scores,
-        remarks=remarks,
+        remarks=(*remarks, *_of_prior(model, others)),
         parameters=_parameters(whole, model),
         horizon=horizon,
         parts=tuple(each.name for each in folds),
@@ -208,6 +212,12 @@ def _fit_alone(
         seconds=time.perf_counter() - began,
         checked=checked,
     )
+
+
+def _of_prior(model: Model, others: OtherMachines | None) -> tuple[str, ...]:
+    """Where the prior of the model came from, if it has one."""
+    learned = model.residual.learned if isinstance(model, CorrectedTwin) else None
+    return () if others is None or learned is None else (f"{others.text.capitalize()}.",)
 
 
 def _select_records(records: Trajectories, settings: Choice) -> Trajectories:

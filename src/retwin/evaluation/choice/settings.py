@@ -12,6 +12,7 @@ from retwin.twins.faults.actuator_faults import Fault
 from retwin.update.corrections import Correction
 from retwin.update.dynamics import Dynamics
 from retwin.update.residual import Density, Mixture, SequenceMixture
+from retwin.update.residual.priors import Priors
 
 MEMBERS = 2
 """Members of a network that is fitted without a part of the records: more lower its error a little,
@@ -62,6 +63,8 @@ class Choice:
         those of its own fit.
     calibrate_on : str or mapping
         The records that are used, see `fit_residual`; only healthy ones are compared.
+    prior : Residual, CorrectedTwin, folder, or several of them, optional
+        Models of other machines of the kind, for a correction with `CommandSpace`.
 
     Raises
     ------
@@ -81,6 +84,7 @@ class Choice:
     yardstick: bool = False
     compare: bool = True
     calibrate_on: str | Mapping[str, Fault | None] = "healthy"
+    prior: Priors | None = None
 
     @classmethod
     def of(cls, case: Corrected) -> Choice:

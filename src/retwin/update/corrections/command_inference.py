@@ -9,15 +9,18 @@ Whether an actuator missed a segment is decided by comparing evidence.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from retwin.checks import require
 from retwin.inference.em import expectation_maximisation
-from retwin.inference.hierarchy import Hierarchy, Likelihood
+from retwin.inference.hierarchy import CONDITION, Design, Hierarchy, Likelihood, normal
+from retwin.inference.hyperprior import Hyperprior
 from retwin.inference.noise import Noise
 from retwin.inference.solver import Solution, blocks
 from retwin.update.corrections.command_problem import CommandProblem
@@ -25,6 +28,8 @@ from retwin.update.corrections.correction import Context, Discrepancy, block_dia
 from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.first_missed import first_missed
 from retwin.update.corrections.held_out_conditions import regression_predicts_better
+from retwin.update.corrections.machines import MISSED, OtherMachines
+from retwin.update.corrections.machines import learned as machine
 from retwin.update.corrections.missed_segments import (
     CommandFit,
     LatentPrior,
@@ -54,6 +59,9 @@ FIRST_JITTER = 1 / 35
 """Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
 SMALLEST_SHARE = 0.1
 """Smallest share of the samples that is taken to be left after z* has been fitted to them."""
+PREDICTED = 20
+"""Runs, measured and predicted, from which a distribution is learned: as many trajectories as a
+residual model is calibrated on. Of fewer, the hyperparameters' posterior predicts the rest."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -99,7 +107,10 @@ def infer_commands(
     missed = first_missed(problem, FIRST_OFFSET * features.spread, FIRST_ODDS)
     problem = problem.with_missed(missed)
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
-    first = Hyperparameters.of(problem, features, start)
+    others = context.others
+    if others is not None:
+        features = replace(features, constants_expected=True)
+    first = Hyperparameters.of(problem, features, start, others, context.rate)
     # Replicates show no more of the variances than one does where the surrogate errs in all alike.
     weight = torch.ones_like(start[:, :1])
     if uncertain.common is not None:
@@ -136,7 +147,12 @@ def infer_commands(
     made = _discrepancy(
         problem, likelihood.x, posterior, found.probability, learned, identified_below
     )
-    return made, learned
+    constant = learned.of_constant(problem)
+    design = constant.features.design(problem)
+    draws = constant.hierarchy.draws(design, certain or likelihood)
+    shown = machine(draws, problem.missed, problem.healthy, context.rate)
+    predicted = _predict_runs(problem, design, draws, learned.missed)
+    return replace(made, learned=shown, predicted=predicted), learned
 
 
 def _require_samples(mask: Tensor) -> None:
@@ -204,6 +220,8 @@ class Hyperparameters:
         Covariance of a sample's error, up to a factor.
     noise : Noise
         Size of that error, in `CommandProblem.unit`.
+    missed : tuple of float
+        Missed segments, and segments, that are assumed besides those measured.
 
     """
 
@@ -212,12 +230,18 @@ class Hyperparameters:
     odds: Tensor
     samples: SampleNoise
     noise: Noise
+    missed: tuple[float, float]
 
     @classmethod
     def of(
-        cls, problem: CommandProblem, features: OffsetFeatures, start: Tensor
+        cls,
+        problem: CommandProblem,
+        features: OffsetFeatures,
+        start: Tensor,
+        others: OtherMachines | None,
+        rate: float,
     ) -> Hyperparameters:
-        """Those before anything is inferred: wide, from first delays only."""
+        """Those before anything is inferred: from first delays, or from what others have shown."""
         moved = (problem.distance * (1 - problem.missed) > 0).any(dim=-1) & problem.valid
         shown = moved if moved.any() else problem.valid
         delay = problem.per_segment(start)[..., 0][shown]
@@ -235,12 +259,18 @@ class Hyperparameters:
         one = torch.ones(2, dtype=torch.float64)
         # Within its range a common delay may be anything, as by a uniform distribution.
         limits = problem.delay_range
+        expected, missed = Hyperprior((sum(limits) / 2, problem.width**2 / 12)), MISSED
+        if others is not None:
+            expected = others.hyperprior(rate, replicated=len(features.replicated) > 0)
+            missed = others.missed
+            coefficients[: len(offset) + 1] = torch.as_tensor(expected.flat[0])
         return cls(
             features,
-            Hierarchy.of(design, variance, coefficients, (sum(limits) / 2, problem.width**2 / 12)),
-            _odds(problem),
+            Hierarchy.of(design, variance, coefficients, expected),
+            _odds(problem, missed),
             SampleNoise.of(problem),
             Noise(scale, one),
+            missed,
         )
 
     def explained(self, problem: CommandProblem, fit: CommandFit, weight: Tensor) -> bool:
@@ -259,6 +289,14 @@ class Hyperparameters:
     def with_regression(self, problem: CommandProblem) -> Hyperparameters:
         """The same to begin with, where offsets depend on direction, distance and pose."""
         features = replace(self.features, regression=True)
+        adapted = self.hierarchy.adapted(features.design(problem))
+        return replace(self, features=features, hierarchy=adapted)
+
+    def of_constant(self, problem: CommandProblem) -> Hyperparameters:
+        """The same to begin with, where offsets have a constant mean."""
+        if not self.features.regression:
+            return self
+        features = replace(self.features, regression=False)
         adapted = self.hierarchy.adapted(features.design(problem))
         return replace(self, features=features, hierarchy=adapted)
 
@@ -285,9 +323,10 @@ class Hyperparameters:
         return Hyperparameters(
             self.features,
             self.hierarchy.learned(design, likelihood),
-            _odds(problem),
+            _odds(problem, self.missed),
             samples,
             self._noise(white, solution),
+            self.missed,
         )
 
     def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
@@ -362,10 +401,39 @@ def _discrepancy(
     return Discrepancy(z, covariance, identified, noise, severity, True, bounded)
 
 
-def _odds(problem: CommandProblem) -> Tensor:
+def _odds(problem: CommandProblem, assumed: tuple[float, float]) -> Tensor:
     """Log odds () that an actuator misses a segment, given those that were missed."""
     missed = (problem.missed * problem.healthy).sum()
-    return ((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit()
+    return ((missed + assumed[0]) / (problem.healthy.sum() + assumed[1])).logit()
+
+
+def _predict_runs(
+    problem: CommandProblem,
+    design: Design,
+    draws: Sequence[Hierarchy],
+    assumed: tuple[float, float],
+) -> Tensor | None:
+    """Draws (J, M, 1 + 2 d_u) of z in further runs, under conditions that were not seen.
+
+    None from enough runs.
+    """
+    further = PREDICTED - len(problem)
+    if further <= 0:
+        return None
+    rng, runs = np.random.default_rng(2), []
+    missed = float((problem.missed * problem.healthy).sum()) + assumed[0]
+    moved = float(problem.healthy.sum()) + assumed[1] - missed
+    common = _common(problem)
+    features = torch.where(design.kind == CONDITION, 0.0, design.features)
+    for j in range(further):
+        row, drawn = j % len(problem), draws[j * len(draws) // further]
+        mean = features[row] @ drawn.coefficients
+        x = mean + drawn.total()[design.group].sqrt() * normal(mean, rng)
+        z = (common[row] @ x.view(len(common[row]), -1, 1))[..., 0]
+        z[..., 0].clamp_(*problem.delay_range)
+        events = rng.random(problem.missed.shape[1:]) < rng.beta(missed, max(moved, assumed[0]))
+        runs.append(torch.cat([z, torch.from_numpy(events).to(z)], dim=-1))
+    return torch.stack(runs)
 
 
 def _common(problem: CommandProblem) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
+from retwin.update.corrections.machines import Learned, OtherMachines
 
 CONSTANT = 1e-6
 """Standard deviation of a constant output, relative to its size: the rounding of numbers."""
@@ -78,6 +79,8 @@ class Context:
         squared; None for a surrogate without error.
     scale : Tensor, optional
         (d_y,), what outputs are divided by to be compared, for a surrogate without `unit`.
+    others : OtherMachines, optional
+        What other machines of the kind have shown of the discrepancy; None for nothing.
 
     """
 
@@ -91,6 +94,7 @@ class Context:
     corrected: Tensor | None = None
     surrogate_variance: Tensor | None = None
     scale: Tensor | None = None
+    others: OtherMachines | None = None
 
     def __len__(self) -> int:
         return len(self.commands)
@@ -203,6 +207,11 @@ class Discrepancy:
     at_bound : Tensor, optional
         (n, M) bool, where the delay is at a bound of its range, so that a better one may lie
         beyond; None where no component of z is bounded.
+    learned : dict, optional
+        What the machine has shown of its hyperparameters, see `corrections.machines`.
+    predicted : Tensor, optional
+        (J, M, d_z), draws of z in further runs of the first trajectories, in turn, each with its
+        own draw of the hyperparameters.
 
     """
 
@@ -213,6 +222,8 @@ class Discrepancy:
     severity: Tensor | None = None
     posterior: bool = False
     at_bound: Tensor | None = None
+    learned: Learned | None = None
+    predicted: Tensor | None = None
 
 
 @runtime_checkable

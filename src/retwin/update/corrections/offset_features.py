@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from retwin.inference.hierarchy import CONDITION, Design
+from retwin.inference.hierarchy import CONDITION, FLAT, Design
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import STILL
 
@@ -52,6 +52,8 @@ class OffsetFeatures:
         (C, 2 d_u), the conditions that are there more than once, see `conditions`.
     regression : bool
         Whether the mean of an offset depends on direction, distance and pose.
+    constants_expected : bool
+        Whether constant offsets are expected to be those of other machines, and are not shrunk.
 
     """
 
@@ -60,6 +62,7 @@ class OffsetFeatures:
     travel: Tensor
     replicated: Tensor
     regression: bool = False
+    constants_expected: bool = False
 
     @classmethod
     def of(cls, problem: CommandProblem) -> OffsetFeatures:
@@ -127,6 +130,8 @@ class OffsetFeatures:
         delay = own.new_tensor([DELAY_VARIANCE]).sqrt()
         single = (1 - match.sum(dim=-1)) * float(len(self.replicated) > 0)
         kinds = torch.arange(1, 1 + count).repeat(width)
+        if self.constants_expected:
+            kinds[::count] = FLAT
         share = own.new_tensor([1.0, ZERO, *[SMALL] * (count - 1)])
         return Design(
             features.flatten(1, 2),

@@ -35,6 +35,7 @@ from retwin.update.corrections.delay_range import bound_note
 from retwin.update.exact import exact_surrogate
 from retwin.update.residual.bands import coverage_figures
 from retwin.update.residual.model import ResidualModel
+from retwin.update.residual.priors import Priors, other_machines
 from retwin.update.residual.refining import refine
 from retwin.update.residual.residual import Residual, segment
 from retwin.update.residual.segment_fitting import fit_segments
@@ -100,6 +101,7 @@ class Options(TypedDict, total=False):
     bounds: NDArray | None
     segments: Segments | str
     twin: Twin | None
+    prior: Priors | None
     progress: Progress | None
 
 
@@ -144,6 +146,7 @@ def fit_residual(
     bounds: NDArray | None = None,
     segments: Segments | str = "commands",
     twin: Twin | None = None,
+    prior: Priors | None = None,
     progress: Progress | None = None,
 ) -> ResidualModel | SequenceResidual | StationaryResidual:
     """Fit the residual model to measured trajectories, from outputs alone (Eq. 7–10).
@@ -176,6 +179,9 @@ def fit_residual(
         The twin that the surrogate was trained on. It simulates the calibration commands, and what
         the surrogate errs there makes z less certain; without it, what the surrogate erred on
         held-out simulations.
+    prior : Residual, CorrectedTwin, folder, or several of them, optional
+        Models of other machines of the kind. What they have learned is expected of this one, the
+        less the more they differ, and hardly if there is a single one; only of `CommandSpace`.
     progress : callable, optional
         Called with the share of the training that is done.
 
@@ -188,10 +194,11 @@ def fit_residual(
     ------
     InputError
         No trajectory to calibrate on, no segment in any, no measurement from which z is
-        identified, or an unknown `calibrate_on`.
+        identified, an unknown `calibrate_on`, or a prior of other channels or another correction.
 
     """
     surrogate = exact_surrogate(surrogate)
+    others = other_machines(prior, correction, surrogate)
     instance(
         "calibration", calibration, Trajectories, remedy="load recorded ones, or simulate a twin"
     )
@@ -210,7 +217,7 @@ def fit_residual(
     given = segments if isinstance(segments, str) else segments[keep]
     rule, parts = _segmented(used, given, needed=not stepwise)
     with training_checked(surrogate, used.commands) as outside:
-        context = _context(surrogate, used, parts, faults, twin)
+        context = replace(_context(surrogate, used, parts, faults, twin), others=others)
         warn_of_error(context, used)
         correction, found = fit_correction(correction, context, *_measured(used))
     require(
@@ -236,8 +243,8 @@ def fit_residual(
     )
     onsets = Segments.from_commands(calibration.commands)
     model.timing = np.where(onsets.valid, onsets.start, np.nan)
-    model.emulated = used.emulated
-    return _noted(model.eval(), outside, missing)
+    model.emulated, model.learned = used.emulated, found.learned
+    return _noted(model.eval(), outside, missing, "" if others is None else others.text)
 
 
 def _segmented(
@@ -272,6 +279,7 @@ def _fit_per_segment(
     """Fit the distribution of one z per segment, (n, M) `valid`, and refine it if it is set so."""
     targets = Targets.of(model, context, found, seed=seed)
     result, held_out = fit_segments(model, targets, bounds=bounds, seed=seed, progress=progress)
+    held_out = held_out[held_out < len(used)]  # a run that was predicted has no outputs
     figures = {"trajectories": float(len(used)), "movements": float(valid.sum())}
     if found.at_bound is not None:
         figures["delays_at_bound"] = share = float(found.at_bound.double()[valid].mean())
@@ -297,12 +305,16 @@ def _fit_per_segment(
     return replace(result, figures=figures | result.figures)
 
 
-def _noted(model: R, outside: str, missing: str) -> R:
+def _noted(model: R, outside: str, missing: str, prior: str = "") -> R:
     """The model; its record states the commands that the surrogate was not trained on.
 
-    It also states in which trajectories nothing was measured.
+    It also states in which trajectories nothing was measured, and where its prior came from.
     """
-    notes = [f"commands outside the surrogate's training: {outside}" if outside else "", missing]
+    notes = [
+        f"commands outside the surrogate's training: {outside}" if outside else "",
+        missing,
+        prior,
+    ]
     if model.fitted is not None:
         reason = "; ".join(filter(None, [model.fitted.reason, *notes]))
         model.fitted = replace(model.fitted, reason=reason)

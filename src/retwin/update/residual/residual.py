@@ -23,6 +23,7 @@ from retwin.nets.training import Fit
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, save_model
 from retwin.update.corrections import Context, Correction
+from retwin.update.corrections.machines import Learned
 from retwin.update.surrogate import Surrogate
 
 D = TypeVar("D")
@@ -61,6 +62,9 @@ class Residual(nn.Module, ABC, Generic[D]):
         (k, M) onsets, in samples, of the segments of the calibration trajectories.
     fitted : Fit or None
         Record of the training.
+    learned : dict or None
+        What the machine has shown to others of its kind, see `corrections.machines`; None where the
+        correction learns nothing of that kind.
 
     """
 
@@ -90,6 +94,7 @@ class Residual(nn.Module, ABC, Generic[D]):
         self.emulated = False
         self.timing: NDArray = np.empty((0, 0))
         self.fitted: Fit | None = None
+        self.learned: Learned | None = None
         self.bounds = nn.Buffer(torch.ones(len(self.latent)))
         self.shift = nn.Buffer(torch.ones(len(self.latent)))
         self.scale = nn.Buffer(torch.ones(len(self.latent)))
@@ -155,6 +160,7 @@ class Residual(nn.Module, ABC, Generic[D]):
             "emulated": self.emulated,
             "timing": [[None if np.isnan(t) else t for t in row] for row in self.timing],
             "fitted": None if self.fitted is None else asdict(self.fitted),
+            "learned": self.learned,
         }
         save_model(folder, self.kind, about, self.state_dict())
 
@@ -180,6 +186,7 @@ class Residual(nn.Module, ABC, Generic[D]):
         model.emulated = about["emulated"]
         model.timing = np.atleast_2d(np.array(about["timing"], dtype=float))
         model.fitted = Fit.of(about["fitted"])
+        model.learned = about.get("learned")
         return model.eval()
 
 

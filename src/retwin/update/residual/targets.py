@@ -55,8 +55,14 @@ class Targets:
             # An event is decided; it has no variance.
             if isinstance(head, BernoulliHead):
                 drawn[..., part] = found.z[..., part]
-        all_valid = valid[..., None].expand_as(found.z)
-        return cls(describe(context), (drawn * valid[..., None]).float(), all_valid, valid)
+        features = describe(context)
+        if found.predicted is not None:
+            # One z of each further run: how uncertain it is, is how much the runs differ.
+            again = torch.arange(len(found.predicted)) % len(valid)
+            drawn = torch.cat([drawn, found.predicted.expand(DRAWS, *found.predicted.shape)], dim=1)
+            features, valid = (torch.cat([each, each[again]]) for each in (features, valid))
+        all_valid = valid[..., None].expand(drawn.shape[1:])
+        return cls(features, (drawn * valid[..., None]).float(), all_valid, valid)
 
     def __getitem__(self, rows: Tensor) -> Targets:
         """Those of some trajectories."""
