@@ -54,7 +54,7 @@ class _Turns(queue.Queue["list[Entry] | None"]):
         return sum(len(each) for events in self._machines.values() for each in events.values())
 
     def _put(self, item: list[Entry] | None) -> None:
-        alarm = item[-1].data if item else {"asset": "", "time": 0}
+        alarm: Mapping[str, Any] = item[-1].data if item else {"asset": "", "time": 0}
         events = self._machines.setdefault(alarm["asset"], {})
         events.setdefault(_event(alarm), deque()).append(item)
 
@@ -73,9 +73,10 @@ class _Turns(queue.Queue["list[Entry] | None"]):
 class Explanations:
     """A thread that explains each alarm from the stored samples before it.
 
-    Machines take turns, and of each machine the newest event is explained first. A context manager that ends the thread. What is found is an entry `cause` of the log; of further
-    alarms of an event it tells whether the fault is the `same`, see `find_cause`. Alarms that have
-    none, since the program was stopped, are explained when it is started again.
+    Machines take turns, and of each machine the newest event is explained first. A context manager
+    that ends the thread. What is found is an entry `cause` of the log; of further alarms of an
+    event it tells whether the fault is the `same`, see `find_cause`. Alarms that have none, since
+    the program was stopped, are explained when it is started again.
 
     Parameters
     ----------
@@ -141,7 +142,9 @@ class Explanations:
             with self._taking:
                 self._take(each for each in alarms if each.sequence > self._last)
 
-    def _take(self, alarms: Iterable[Entry], explained: Mapping[int, dict[str, Any]] = NONE) -> None:
+    def _take(
+        self, alarms: Iterable[Entry], explained: Mapping[int, dict[str, Any]] = NONE
+    ) -> None:
         """Queue alarms, each after the first and the newest of its event, or those before it."""
         for entry in alarms:
             asset = entry.data["asset"]

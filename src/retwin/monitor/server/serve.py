@@ -51,13 +51,14 @@ class _Protocol(H11Protocol):
 
     def _expect(self, *, ended: bool = False) -> None:
         """Close the connection later, unless another request than the present one has begun."""
-        before = self.cycle
         if self._deadline is not None:
             self._deadline.cancel()
         if not ended:
-            self._deadline = self.loop.call_later(
-                HEADERS, lambda: self.cycle is before and self.transport.close()
-            )
+            self._deadline = self.loop.call_later(HEADERS, self._close_after, self.cycle)
+
+    def _close_after(self, cycle: object) -> None:
+        if self.cycle is cycle:
+            self.transport.close()
 
 
 def listening(host: str, port: int) -> socket.socket:
