@@ -226,7 +226,7 @@ def _alarm(data: dict[str, Any], first: int, period: float) -> Alarm:
     return Alarm("", sample, 0.0, *about, event, True, tuple(data["machine"]))
 
 
-def _event(alarm: dict[str, Any]) -> int:
+def _event(alarm: Mapping[str, Any]) -> int:
     """The time of the first alarm of an alarm's event."""
     return int(alarm.get("event", alarm["time"]))
 
