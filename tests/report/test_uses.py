@@ -6,19 +6,16 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from synthetic_study import Study, synthetic
 
 from retwin.report.study import read_study
 from retwin.report.uses import use_rows
 from retwin.results import Results, read_results
 from retwin.scores.uses import Requirement, answer_of, uses_of
-from tests.report.conftest import synthetic
 
-Study = tuple[dict[str, Any], dict[str, NDArray]]
 Write = Callable[[Study], Path]
 
 

@@ -39,7 +39,7 @@ Correction = Annotated[
 Compare = Annotated[bool, rare("", "Compare candidates.", "--compare/--no-compare")]
 Yardstick = Annotated[
     bool | None,
-    rare("", "Compare with models without the twin.", "--yardstick/--no-yardstick"),
+    rare("", "Add models without a twin.", "--yardstick/--no-yardstick"),
 ]
 TwinSet = Annotated[Path | None, rare("FILE", "Trajectories of the twin; else simulated.")]
 Simulations = Annotated[int | None, rare("N", "Trajectories simulated; else the case's.")]
@@ -53,9 +53,7 @@ Density = Annotated[
     str | None,
     rare("NAME", "mixture, flow or sequence_mixture.", names=catalog.DENSITIES),
 ]
-Prior = Annotated[
-    list[Path] | None, option("FOLDER", "A model of another such machine; may be repeated.")
-]
+Prior = Annotated[list[Path] | None, option("FOLDER", "Models of other such machines.")]
 Refine = Annotated[bool, rare("", "Fine-tune on outputs afterwards.", "--refine")]
 
 
