@@ -126,9 +126,14 @@ class FidelityResults(ResultsPart):
 
 
 class OverlayInfo(ResultsPart):
-    """The source whose predictions stand beside the test trajectories, and its components of z."""
+    """The source whose predictions stand beside test trajectories, and its components of z.
+
+    `ids` are those trajectories, in the order of `data.test.ids`; empty in files of versions that
+    simulated all of them.
+    """
 
     source: str
+    ids: list[str] = Field(default=[])
     latents: list[str] = Field([], alias="movement")
     latent_units: list[str] = Field([], alias="movement_units")
 
@@ -283,6 +288,15 @@ class Results(ResultsPart):
             if name not in self.sources:
                 raise ValueError(f"{name!r} is none of the sources")
         return self
+
+    @property
+    def overlaid(self) -> list[int]:
+        """Places in `data.test` of the trajectories of the overlay; none without one."""
+        if self.overlay is None:
+            return []
+        tested = self.data.test.ids
+        known = set(self.overlay.ids or tested)
+        return [place for place, name in enumerate(tested) if name in known]
 
     def has(self, metric: str) -> bool:
         """Whether any source has the metric."""

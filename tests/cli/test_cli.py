@@ -293,7 +293,7 @@ def test_a_study_of_a_case_of_ones_own(call, own: Path, words: tuple) -> None:
     printed_again = json.loads(call(*words, "--json")[1])
     assert printed_again.keys() == {
         *("title", "emulated", "classifier", "runs", "test_trajectories"),
-        *("sources", "comparisons", "report"),
+        *("sources", "comparisons", "uses", "report"),
     }
     for source in printed_again["sources"].values():
         assert source.keys() in ({"title", *SCORES}, {"title", *ERRORS})

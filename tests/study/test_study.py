@@ -76,7 +76,11 @@ def test_results_follow_the_schema(finished: tuple[dict, Path], case: rt.Case) -
         assert (row["p_verdict"], row["no_verdict"]) == (None, "few runs"), "two runs"
         assert 0 < row["p_bootstrap"] <= 1
     found = results["fidelity"]["ibg_rg"]
-    assert (found["trajectories"], found["movements"]) == (10, 50)
+    assert (found["trajectories"], found["movements"]) == (8, 40), "four of each fold"
+    shown = [results["data"]["test"]["ids"].index(name) for name in results["portrait"]["ids"]]
+    assert shown == sorted(shown)
+    labels = [results["data"]["test"]["labels"][place] for place in shown]
+    assert {label: labels.count(label) for label in case.classes} == dict.fromkeys(case.classes, 8)
     assert found["rivals"] == ["mean_only", "single_gaussian"]
     assert found["widening"] > 0
     for name in ("energy", "crps/x", "crps_below/mean_only", "coverage90", "pit", "auroc"):
@@ -98,6 +102,7 @@ def test_figures_agree_with_the_predictions(finished: tuple[dict, Path]) -> None
             np.testing.assert_array_equal(predicted, source["predictions"])
             assert source["accuracy"] == pytest.approx((predicted == truth).mean(axis=1).tolist())
         assert arrays["z/ibg_rg/observed"].shape[1] == 7
+        assert len(arrays["portrait/bands"]) == len(arrays["pose/updated"]) == 72
         assert arrays["pit/ibg_rg"].shape == (3, 20)
         assert arrays["bands/ibg_rg/quantiles"].shape == (2, 5, 100, 3)
         healthy = {
@@ -293,6 +298,8 @@ def test_a_study_that_cannot_be_is_refused_at_once(case: rt.Case, tmp_path: Path
         ({"runs": 1.5}, "runs: expected a whole number from 1 to 1000, got 1.5"),
         ({"runs": float("nan")}, "runs: expected a whole number from 1 to 1000, got nan"),
         ({"per_class": 0}, "per_class: expected a whole number from 1 to 10000000"),
+        ({"emulated_healthy": 0}, "emulated_healthy: expected a whole number from 1"),
+        ({"overlaid": 0}, "overlaid: expected a whole number of at least 1"),
         ({"folds": 1}, "folds: expected a whole number of at least 2"),
         ({"seed": -1}, "seed: expected a whole number of at least 0"),
         ({"calibrate_on": "some"}, "calibrate_on: expected one of healthy, all"),

@@ -27,6 +27,10 @@ DEMO = ("dt", "ibg_rg_command", "inversion")
 """What the demo compares: the original twin, and what is best here."""
 DEMO_PER_CLASS = 200
 """Generated trajectories per class in the demo, half of a study's, which keeps it short."""
+DEMO_HEALTHY = 125
+"""Emulated healthy trajectories in the demo: a promise at 5 % false alarms can then be decided."""
+DEMO_OVERLAID = 10
+"""Trajectories of each class and fold that the page of the demo shows in full."""
 DEMO_MINUTES = 4
 """Minutes that a run of the demo takes at most on two cores, as measured."""
 COMPARED = {"a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict"}
@@ -156,7 +160,15 @@ def demo(
         recorded = arm / "sim.mat"
         data = StudyData(twin=recorded if recorded.exists() else None, real=real)
     target = out or Path("demo", "real" if folder else "emulated")
-    plan = StudyPlan(DEMO, runs=runs, seed=seed, folds=folds, per_class=DEMO_PER_CLASS)
+    plan = StudyPlan(
+        DEMO,
+        runs=runs,
+        seed=seed,
+        folds=folds,
+        per_class=DEMO_PER_CLASS,
+        emulated_healthy=DEMO_HEALTHY,
+        overlaid=DEMO_OVERLAID,
+    )
     titles = ", ".join(catalog.SOURCES[name].title for name in DEMO)
     kind = "real" if folder else "emulated"
     minutes = DEMO_MINUTES * plan.number_of_runs
@@ -271,5 +283,8 @@ def _uses(results: Results) -> Table:
     """The four uses, as on the first screen of the page."""
     from retwin.report.uses import use_rows
 
-    rows = [(r.title, r.answer, r.source, r.reached, r.missing) for r in use_rows(results)]
-    return table(("use", "answer", "best source", "what it reaches", "missing"), rows)
+    rows = [
+        (f"{r.title}\n{r.answer}", f"{r.source}: {r.reached}\nMissing: {r.missing}.")
+        for r in use_rows(results)
+    ]
+    return table(("use", "best source, and what it reaches"), rows)

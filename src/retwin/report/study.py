@@ -95,7 +95,7 @@ class Study:
         overlay, bands = self.results.overlay, self.arrays.get("portrait/bands")
         if overlay is None or bands is None:
             return
-        n, outputs = len(self.results.data.test.ids), len(self.results.outputs.names)
+        n, outputs = len(self.results.overlaid), len(self.results.outputs.names)
         self._require("portrait/bands", (n, 5, None, outputs))
         require(
             np.isfinite(bands).all(),
@@ -166,6 +166,11 @@ class Study:
             test = self.results.data.test
             return np.ones(len(test.ids) or test.size, dtype=bool)
         return labels == HEALTHY
+
+    @property
+    def overlaid_healthy(self) -> NDArray:
+        """Whether each trajectory of the overlay is healthy."""
+        return self.healthy[self.results.overlaid]
 
     @property
     def output_quantities(self) -> list[tuple[float, str]]:

@@ -90,11 +90,11 @@ and the mean of those that the updated twin generates, if it is known."""
 def _segment_values(study: Study) -> Values:
     """Delays, offsets and missed segments, inferred from every healthy test trajectory."""
     overlay, values = study.results.overlay, study.arrays.get("portrait/z")
-    if overlay is None or values is None or not study.healthy.any():
+    if overlay is None or values is None or not study.overlaid_healthy.any():
         return
     units = quantities(overlay.latent_units, len(overlay.latents))
     for column, (name, (factor, unit)) in enumerate(zip(overlay.latents, units, strict=True)):
-        yield name, unit, factor * values[study.healthy, :, column].astype(float), None
+        yield name, unit, factor * values[study.overlaid_healthy, :, column].astype(float), None
 
 
 def _held_out_values(study: Study) -> Values:
@@ -175,7 +175,7 @@ def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
         return None
     names = "nominal", "observed", "times", "bands"
     nominal, observed, times, bands = (portrait[name] for name in names)
-    chosen = partial(median_error_trajectory, nominal, observed, times, study.healthy)
+    chosen = partial(median_error_trajectory, nominal, observed, times, study.overlaid_healthy)
     # Where no healthy trajectory is complete, one of which most was measured.
     place = chosen() if chosen() is not None else chosen(least=MOSTLY)
     if place is None:
@@ -183,11 +183,11 @@ def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
     outputs = study.results.outputs
     # Masked, since an output may lack any measured value.
     measured = np.ma.masked_invalid(observed.astype(float))
-    spread = measured[study.healthy].std(axis=(0, 1)).filled(0.0)
+    spread = measured[study.overlaid_healthy].std(axis=(0, 1)).filled(0.0)
     error = np.sqrt(np.square(measured[place] - nominal[place]).mean(axis=0).filled(0.0))
     column = int(np.argmax(error / np.where(spread > 0, spread, np.inf)))
     time = np.arange(nominal.shape[1]) / float(portrait["rate"])
-    where = f"a typical healthy run ({study.results.data.test.ids[place]})"
+    where = f"a typical healthy run ({study.results.data.test.ids[study.results.overlaid[place]]})"
     values = nominal[place, :, column], observed[place, :, column], bands[place, :, :, column]
     shown = outputs.names[column], *study.output_quantities[column]
     return _panel(shown, where, time, values, colour_of(pair[0]))

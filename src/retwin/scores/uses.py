@@ -156,7 +156,7 @@ def error_of(results: Results, arrays: Arrays) -> tuple[ErrorChange, str, str] |
     names = [f"portrait/{name}" for name in ("nominal", "observed", "bands")]
     if results.overlay is None or any(name not in arrays for name in names):
         return None
-    healthy = np.array(results.data.test.labels) == HEALTHY
+    healthy = np.array(results.data.test.labels)[results.overlaid] == HEALTHY
     if not healthy.any():
         return None
     nominal, observed, bands = (np.asarray(arrays[name])[healthy].astype(float) for name in names)

@@ -22,8 +22,6 @@ from retwin.update.corrected import generate
 
 EMULATED_PER_CLASS = 10
 """Emulated trajectories per class where there are no real ones: 90 for the arm, as measured."""
-EMULATED_HEALTHY = 125
-"""Emulated healthy runs, so that each answer on 5 % false alarms can be yes or no."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +113,7 @@ def real_data(
         real = read(data.real)
     elif case.emulator is not None:
         seed = plan.seed_of("emulated", 0)
-        real = _emulated(case, seed)
+        real = _emulated(case, plan.emulated_healthy, seed)
     else:
         raise InputError(
             "real data",
@@ -129,8 +127,8 @@ def real_data(
     return real, Roles.of((first[fit], first[test]) for fit, test in folds)
 
 
-def _emulated(case: Case, seed: int) -> Trajectories:
-    """Few runs of each fault, and enough healthy ones."""
+def _emulated(case: Case, healthy: int, seed: int) -> Trajectories:
+    """Few runs of each fault, and so many healthy ones."""
     first, second = np.random.SeedSequence(seed).spawn(2)
     seeds = [int(each.generate_state(1)[0]) for each in (first, second)]
     emulator: Any = case.emulator
@@ -140,7 +138,7 @@ def _emulated(case: Case, seed: int) -> Trajectories:
     faulty = faulty[faulty.labels != HEALTHY]
     only = replace(case, faults={HEALTHY: case.faults[HEALTHY]})
     return Trajectories.concatenate(
-        [generate(emulator, only, per_class=EMULATED_HEALTHY, seed=seeds[1]), faulty]
+        [generate(emulator, only, per_class=healthy, seed=seeds[1]), faulty]
     )
 
 

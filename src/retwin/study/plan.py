@@ -78,6 +78,11 @@ class StudyPlan:
         software, and a diagnoser could exploit that they do not move at all.
     learning_curve : bool
         Whether sources that are calibrated on healthy trajectories are also calibrated on fewer.
+    emulated_healthy : int
+        Healthy trajectories of the emulated set that stands in for a real one, at least 1.
+    overlaid : int, optional
+        Test trajectories per class and fold that are simulated for the fidelity and for the
+        predictive overlay, at least 1; by default all. Diagnoses are of all in any case.
 
     Raises
     ------
@@ -97,6 +102,8 @@ class StudyPlan:
     calibrate_on: str = "healthy"
     encoder_noise: float = 0.0
     learning_curve: bool = False
+    emulated_healthy: int = 10
+    overlaid: int | None = None
 
     def __post_init__(self) -> None:
         one_of("preset", self.preset, PRESETS)
@@ -118,6 +125,9 @@ class StudyPlan:
             whole("per_class", self.per_class, least=1, most=MAX_PER_CLASS)
         if self.rate is not None:
             sample_rate("rate", self.rate)
+        whole("emulated_healthy", self.emulated_healthy, least=1, most=MAX_PER_CLASS)
+        if self.overlaid is not None:
+            whole("overlaid", self.overlaid, least=1)
         finite("encoder_noise", self.encoder_noise, least=0.0, unit="command units")
 
     def generated(self, case: Case) -> int:

@@ -68,9 +68,12 @@ def write_results(
     overlay = _overlay(work)
     shown: dict[str, Any] = {}
     if overlay is not None:
-        arrays |= _overlay_arrays(work, test, overlay) | _poses(work, test, overlay)
+        known = set(overlay.ids.tolist())
+        shown_test = test[[name in known for name in test.ids.tolist()]]
+        arrays |= _overlay_arrays(work, shown_test, overlay) | _poses(work, shown_test, overlay)
         shown["portrait"] = {
             "source": work.overlay_jobs()[0].name,
+            "ids": shown_test.ids.tolist(),
             "movement": overlay.latent.names,
             "movement_units": overlay.latent.units,
         }
@@ -339,7 +342,7 @@ def _overlay(work: Work) -> Overlay | None:
 
 
 def _overlay_arrays(work: Work, test: Trajectories, overlay: Overlay) -> dict[str, NDArray]:
-    """Every test trajectory at the sensor's rate, in the order of `data.test.ids`.
+    """The simulated test trajectories at the sensor's rate, in the order of `data.test.ids`.
 
     `portrait/commands` (n, P, d_u), `/nominal`, `/observed` (n, P, d), the latter NaN where not
     measured, and `/rate` in Hz; the rest as in `Overlay`.
@@ -358,7 +361,7 @@ def _overlay_arrays(work: Work, test: Trajectories, overlay: Overlay) -> dict[st
 
 
 def _poses(work: Work, test: Trajectories, overlay: Overlay | None = None) -> dict[str, NDArray]:
-    """Skeletons of all test trajectories at the sensor's rate.
+    """Skeletons of the simulated test trajectories at the sensor's rate.
 
     `pose/nominal`, `pose/observed` and, of the median of the updated twin's draws, `pose/updated`
     (n, P, points, 3) in m.

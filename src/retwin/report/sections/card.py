@@ -140,10 +140,11 @@ def _missed(study: Study, source: str) -> list[tuple[str, float]]:
 
 
 def _trajectories(study: Study, names: Sequence[str]) -> Cell:
-    """Their ids, as links to the explorer where there is one."""
-    if not study.explorable:
-        return Cell(", ".join(names))
-    return Cell("", links=[Link(name, f"trajectory={quote(name, safe='')}") for name in names])
+    """Their ids, as links to the explorer where it shows them."""
+    ids = study.results.data.test.ids
+    shown = {ids[place] for place in study.results.overlaid} if study.explorable else set()
+    links = [Link(n, f"trajectory={quote(n, safe='')}" if n in shown else "") for n in names]
+    return Cell("", links=links)
 
 
 def _setup(study: Study) -> dict[str, str]:

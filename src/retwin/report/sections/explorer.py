@@ -67,10 +67,11 @@ def _content(study: Study, overlay: OverlayInfo) -> dict[str, Any]:
     )
     scale = np.array([factor for factor, _ in outputs])
     sources = [name for name in study.sources if study.probabilities(name).size]
-    probabilities = [study.probabilities(name).mean(axis=0) for name in sources]
+    shown = results.overlaid
+    probabilities = [study.probabilities(name).mean(axis=0)[shown] for name in sources]
     return {
-        "ids": results.data.test.ids,
-        "truth": study.truth.tolist(),
+        "ids": [results.data.test.ids[place] for place in shown],
+        "truth": study.truth[shown].tolist(),
         "classes": [class_name(name) for name in results.classes],
         "sources": [{"name": source_name(n), "colour": colour_index(n)} for n in sources],
         "probabilities": packed(np.array(probabilities)) if sources else None,

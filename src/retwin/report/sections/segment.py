@@ -58,7 +58,8 @@ def segment(study: Study) -> Segment | None:
     if not portrait:
         return None
     nominal, observed, times = (portrait[name] for name in ("nominal", "observed", "times"))
-    healthy = study.healthy if study.healthy.any() else np.ones(len(nominal), dtype=bool)
+    healthy = study.overlaid_healthy
+    healthy = healthy if healthy.any() else np.ones(len(nominal), dtype=bool)
     place = median_error_trajectory(nominal, observed, times, healthy)
     if place is None:
         return None
@@ -70,7 +71,7 @@ def segment(study: Study) -> Segment | None:
         return None
     known = times[place][np.isfinite(times[place]).all(axis=1)]
     return Segment(
-        study.results.data.test.ids[place],
+        study.results.data.test.ids[study.results.overlaid[place]],
         study.results.outputs.names[error.output],
         units[error.output][1],
         np.arange(nominal.shape[1]) / rate,
