@@ -283,8 +283,8 @@ def _uses(results: Results) -> Table:
     """The four uses, as on the first screen of the page."""
     from retwin.report.uses import use_rows
 
-    rows = [
-        (f"{r.title}\n{r.answer}", f"{r.source}: {r.reached}\nMissing: {r.missing}.")
-        for r in use_rows(results)
-    ]
+    rows = []
+    for row in use_rows(results):
+        reached = f"{row.source}: {row.reached}" if row.source else row.reached
+        rows.append((f"{row.title}\n{row.answer}", f"{reached}\nMissing: {row.missing}."))
     return table(("use", "best source, and what it reaches"), rows)

@@ -24,7 +24,7 @@ RULE = (
 
 @dataclass(frozen=True)
 class UseRow:
-    """A row: the use, its answer, its best source, what that reaches, and what is missing."""
+    """A row: the use, its answer, its best source ("" without one), what it reaches and lacks."""
 
     title: str
     answer: str
@@ -39,7 +39,7 @@ def use_rows(results: Results) -> list[UseRow]:
         UseRow(
             TITLES[use.use],
             use.answer,
-            source_name(use.source) if use.source else "–",
+            source_name(use.source) if use.source else "",
             _reached(use),
             _missing(use, faults=bool(results.classes)),
         )
