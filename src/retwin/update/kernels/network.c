@@ -1,7 +1,14 @@
 /* A dense network with SiLU activations, in single precision: BLOCK inputs at a time, so that their
    activations stay in the processor's nearest cache. `network.py` packs its weights. */
 
+/* As many as a register holds: gcc keeps longer vectors in memory, which takes 20 times as long. */
+#if defined __AVX512F__
 #define LANES 16
+#elif defined __AVX__
+#define LANES 8
+#else
+#define LANES 4
+#endif
 #define VECTORS 2
 #define BLOCK (LANES * VECTORS)
 #define OUTPUTS 6 /* outputs of a layer that are computed together, in registers */
