@@ -10,6 +10,7 @@ from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from retwin.report.study import read_study
 Study = tuple[dict[str, Any], dict[str, NDArray]]
 Write = Callable[[Study], Path]
 LOADING = {"src", "href", "srcset", "action", "poster", "data", "xlink:href"}
-PNG = b"\x89PNG\r\n\x1a\n"
+SVG = "{http://www.w3.org/2000/svg}"
 
 
 class Reader(HTMLParser):
@@ -56,7 +57,7 @@ class Reader(HTMLParser):
 
 def page_of(folder: Path) -> str:
     study = read_study(folder)
-    return render(study, sections_of(study), {})
+    return render(study, sections_of(study))
 
 
 def read(folder: Path) -> Reader:
@@ -79,10 +80,12 @@ def test_page_is_self_contained_and_figures_are_beside_it(study: Study, write: W
     assert "url(" not in style
     assert "@import" not in style
     assert "default-src 'none'" in text
-    made = {path.stem: path.read_bytes() for path in (folder / "figures").glob("*.png")}
+    made = {
+        path.stem: ElementTree.parse(path).getroot() for path in (folder / "figures").glob("*.svg")
+    }
     simulated = {"simulation", "autocorrelation", "crosscorrelation", "spectra", "amplitude"}
     assert set(made) == set(FIGURES) - simulated - {"overtime", "delta", "z", "records"}
-    assert all(each.startswith(PNG) for each in made.values())
+    assert all(each.find(f".//{SVG}text") is not None for each in made.values())
 
 
 @pytest.mark.slow
@@ -379,7 +382,7 @@ def test_without_arrays_and_stale_figures(study: Study, write: Write) -> None:
     write_report(folder)
     (folder / "arrays.npz").unlink()
     for name in ("tde-2", "mine"):
-        (folder / "figures" / f"{name}.png").write_bytes(PNG)
+        (folder / "figures" / f"{name}.svg").touch()
     write_report(folder)
     reader = read(folder)
     assert "roc" not in reader.ids
