@@ -19,7 +19,7 @@ from retwin.report.sections import sections_of
 from retwin.report.study import Study, read_study
 from retwin.report.summary import picture, summary
 from retwin.report.svg import svg_file
-from retwin.report.verdict import outcome_of, verdict
+from retwin.report.verdict import headline, outcome_of, verdict
 from retwin.scores.bootstrap import MIN_RECORDS
 from retwin.scores.comparison import MIN_RUNS
 from retwin.scores.uses import RATE
@@ -108,6 +108,7 @@ def render(study: Study, sections: Sequence[Section]) -> str:
         "interval": lambda each: labels.difference(each, units)[1],
     }
     found = summary(study)
+    pair = headline(study.results)
     front = [found["figure"]] if found and found["figure"] else []
     templates.globals |= {
         "results": study.results,
@@ -119,6 +120,8 @@ def render(study: Study, sections: Sequence[Section]) -> str:
         "rate": RATE,
         "docs": DOCS,
         "verdict": verdict(study),
+        "own": pair[0] if pair else next(reversed(study.results.sources)),
+        "plain": pair[1] if pair else "",
     }
 
     def fill(name: str, values: Mapping[str, Any]) -> Markup:
