@@ -64,8 +64,8 @@ def svg_file(shown: Figure | Matrices, *, emulated: bool) -> str:
             parts.append(f'<g transform="translate({place * width} {y})">{"".join(inner)}</g>')
         y += max(height for height, _ in line)
     legend, y = _legend(keys, whole, y)
-    drawn = _element(whole, y, [*parts, *legend])
-    return re.sub(r"var\(--(\w+)\)", lambda found: hexadecimal(found[1]), drawn)
+    made = _element(whole, y, [*parts, *legend])
+    return re.sub(r"var\(--(\w+)\)", lambda found: hexadecimal(found[1]), made)
 
 
 def svg_panel(panel: Panel, width: int) -> str:
