@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 from retwin.report.figure import Band, Figure, Line, Points, Spans
+from retwin.report.page import render
 from retwin.report.plotly_specs import panel_spec
+from retwin.report.sections import sections_of
 from retwin.report.sections.delta import delta
 from retwin.report.sections.residuals import residuals
 from retwin.report.study import Study
@@ -150,6 +153,18 @@ def learned(simulated: Content) -> Content:
         }
     )
     return simulated
+
+
+def test_each_section_of_a_simulation_begins_with_its_answer(learned: Content) -> None:
+    study = study_of(learned)
+    page = render(study, sections_of(study))
+    bodies = re.findall(r'<section id="(\w+)">.*?<p class="verdict">(.*?)</p>', page, re.DOTALL)
+    answers = {name: re.sub(r"<[^>]+>", "", text) for name, text in bodies}
+    assert {"scores", "simulation", "residuals", "delta", "card"} <= set(answers)
+    assert answers["simulation"].startswith("From the commands alone, the error of the test")
+    assert "has a mean of" in answers["residuals"]
+    assert answers["delta"].startswith("1 curve of the corrected state equations differs")
+    assert all(re.search(r"\d", text) for name, text in answers.items()), answers
 
 
 def test_the_learned_curve_has_a_band_and_the_ends_of_its_domain(
