@@ -23,7 +23,7 @@ from retwin.report import write_report
 MARKED = (
     "Use",
     "Answer",
-    "Best source, and what it reaches",
+    "Error ",
     "Missing",
     "“Yes” and “no” need",
     "in a typical healthy run",

@@ -89,7 +89,8 @@ def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
 def _table(source: str, found: list[Decision]) -> Table:
     digits = distinct(each.threshold for each in found)
     title = f"Cost of a false-alarm rate, {source_name(source)}"
-    return tabulate(title, HEADS, [_row(each, digits) for each in found])
+    rows = [_row(each, digits) for each in found]
+    return tabulate(title, HEADS[:6] + HEADS[8:], [[*row[:6], *row[8:]] for row in rows])
 
 
 def _row(each: Decision, digits: int) -> list[object]:
