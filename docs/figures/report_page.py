@@ -23,7 +23,7 @@ from retwin.report import write_report
 MARKED = (
     "Use",
     "Answer",
-    "Error ",
+    "of the original.",
     "Missing",
     "“Yes” and “no” need",
     "in a typical healthy run",

@@ -114,6 +114,10 @@ def test_numbers(study: Study, write: Write) -> None:
     for count in np.diag(results["sources"]["ibg_rg"]["confusion"]):
         assert str(count) in text
     assert "M4 bias" in text
+    counts = np.array(results["sources"]["ibg_rg"]["confusion"])
+    worst = (counts * (1 - np.eye(9, dtype=int))).max()
+    assert f"{np.trace(counts)} of {counts.sum()} diagnoses are correct; the most" in text
+    assert re.search(rf"the most frequent error is \S.* as \S.* \({worst}\)", text)
 
 
 def test_every_section_begins_with_its_answer_in_figures(study: Study, write: Write) -> None:
