@@ -21,14 +21,13 @@ from style import ORANGE, write
 from retwin.report import write_report
 
 MARKED = (
-    "Error on healthy runs",
-    "Ready for:",
-    "Not ready for:",
-    "Next:",
-    "One rule for all lights",
+    "Use",
+    "Answer",
+    "of the original.",
+    "Missing",
+    "“Yes” and “no” need",
     "in a typical healthy run",
     "What was learned",
-    "What speaks against it",
 )
 """What is marked, from 1 on, by the text with which it begins or that it holds."""
 SIZE = {"width": 1300, "height": 1850}

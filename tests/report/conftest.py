@@ -47,6 +47,6 @@ def rendered() -> Callable[[Path], str]:
 
     def _rendered(folder: Path) -> str:
         whole = read_study(folder)
-        return render(whole, sections_of(whole), {})
+        return render(whole, sections_of(whole))
 
     return _rendered

@@ -380,6 +380,6 @@ def test_without_scripts_there_are_pictures(browser: Browser, study_page: Path) 
         page.goto(study_page.as_uri())
         for part in page.locator("details.part > summary").all():
             part.click()
-        shown = [image.bounding_box() for image in page.locator("noscript img").all()]
+        shown = [image.bounding_box() for image in page.locator(".picture > div > svg").all()]
         assert len(shown) > 8
-        assert all(box is not None and box["width"] > 300 for box in shown)
+        assert all(box is not None and box["width"] > 250 for box in shown)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,13 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 from retwin.report.figure import Band, Figure, Line, Points, Spans
+from retwin.report.page import render
 from retwin.report.plotly_specs import panel_spec
-from retwin.report.png import draw
+from retwin.report.sections import sections_of
 from retwin.report.sections.delta import delta
 from retwin.report.sections.residuals import residuals
 from retwin.report.study import Study
+from retwin.report.svg import svg_file
 from retwin.results import Results
 
 RATE, LAG = 50.0, 5
@@ -110,7 +113,7 @@ def test_the_figures_show_it(simulated: Content) -> None:
 
 def test_both_renderers_draw_them(simulated: Content) -> None:
     for figure in figures_of(simulated).values():
-        assert draw(figure).axes
+        assert "<path" in svg_file(figure, emulated=True)
         assert all(panel_spec(panel)["data"] for panel in figure.panels)
 
 
@@ -131,7 +134,7 @@ def test_outputs_never_measured_or_without_error(simulated: Content, value: floa
     for name in ("twin", "pi_ls"):
         simulated[1][f"simulation/{name}/mean"][:] = 0.0
     for figure in figures_of(simulated).values():
-        assert draw(figure).axes
+        assert "<path" in svg_file(figure, emulated=True)
 
 
 @pytest.fixture
@@ -152,6 +155,18 @@ def learned(simulated: Content) -> Content:
     return simulated
 
 
+def test_each_section_of_a_simulation_begins_with_its_answer(learned: Content) -> None:
+    study = study_of(learned)
+    page = render(study, sections_of(study))
+    bodies = re.findall(r'<section id="(\w+)">.*?<p class="verdict">(.*?)</p>', page, re.DOTALL)
+    answers = {name: re.sub(r"<[^>]+>", "", text) for name, text in bodies}
+    assert {"scores", "simulation", "residuals", "delta", "card"} <= set(answers)
+    assert answers["simulation"].startswith("From the commands alone, the error of the test")
+    assert "has a mean of" in answers["residuals"]
+    assert answers["delta"].startswith("1 curve of the corrected state equations differs")
+    assert all(re.search(r"\d", text) for name, text in answers.items()), answers
+
+
 def test_the_learned_curve_has_a_band_and_the_ends_of_its_domain(
     learned: Content, write: Callable[[Content], Path], rendered: Callable[[Path], str]
 ) -> None:
@@ -161,7 +176,7 @@ def test_the_learned_curve_has_a_band_and_the_ends_of_its_domain(
     (spans,), (band,), (_, line) = (marks(figure, kind) for kind in (Spans, Band, Line))
     assert spans.intervals == [(-0.25, 0.0), (1.0, 1.25)]
     np.testing.assert_allclose(np.asarray(band.high) - line.y, 0.16449, rtol=1e-3)
-    assert draw(figure).axes
+    assert "<path" in svg_file(figure, emulated=True)
     page = rendered(write(learned))
     assert all(f'<section id="{name}">' in page for name in ("residuals", "delta"))
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from retwin.report.blocks import Cell, Column, Table
 from retwin.report.glossary import explained
-from retwin.report.labels import distinct, learned_name, percent, percents, stage_name
+from retwin.report.labels import distinct, learned_name, percent, percents
 from retwin.report.page import DOCS
 
 
@@ -58,9 +58,6 @@ def test_names_for_people() -> None:
     assert learned_name("offset_motor_1") == "Offset, motor 1"
     assert learned_name("missed_motor_2") == "Missed segments, motor 2"
     assert learned_name("delay") == "Delay"
-    assert stage_name("diagnosis ibg_rg") == "Diagnosis, Updated twin (outputs)"
-    assert stage_name("portrait ibg_rg") == "Predictive bands, Updated twin (outputs)"
-    assert stage_name("surrogate_fit_s") == "Surrogate fit"
 
 
 def test_every_section_links_to_a_heading_of_the_documentation(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Iterable, Mapping
+import zlib
+from collections.abc import Iterable
 from importlib import resources
 from math import isfinite
 from types import FunctionType
@@ -20,22 +21,19 @@ from retwin.report import labels
 from retwin.report.figure import Figure, Matrices
 from retwin.report.plotly_specs import figure_specs
 from retwin.report.style import CHROME, PALETTE, colour_of, symbol
+from retwin.report.svg import svg_panel
 
 LABELS = {name: each for name, each in vars(labels).items() if isinstance(each, FunctionType)}
 """The filters of all templates, under their own names."""
 
 
-def environment(
-    *, emulated: bool = False, images: Mapping[str, bytes] | None = None
-) -> Environment:
+def environment(*, emulated: bool = False) -> Environment:
     """The templates, with what all pages have in common.
 
     Parameters
     ----------
     emulated : bool
         Whether a page says that its data are emulated.
-    images : mapping of str to bytes, optional
-        WebP pictures by figure, which are shown where scripts do not run.
 
     """
     made = Environment(
@@ -50,7 +48,7 @@ def environment(
     made.tests["finite"] = isfinite
     made.globals |= {
         "emulated": emulated,
-        "images": {name: base64.b64encode(each).decode() for name, each in (images or {}).items()},
+        "drawing": lambda panel, width: Markup(svg_panel(panel, width)),
         "anchors": set(),
         "colour_of": colour_of,
         "symbol": symbol,
@@ -107,9 +105,10 @@ def asset(name: str, folder: str = "templates") -> Markup:
     return Markup(resources.files(__package__).joinpath(folder, name).read_text(encoding="utf-8"))
 
 
-def plotly_js() -> Markup:
-    """The bundle of plotly.js with scatter plots in the plane and in space.
+def plotly_js() -> str:
+    """The bundle of plotly.js with scatter plots in the plane and in space, deflated, in base 64.
 
     It is plotly.js-gl3d-dist-min 4.1.1 as npm has it: a third of the bytes of the whole library.
     """
-    return asset("plotly-gl3d.min.js", "plotly")
+    code = asset("plotly-gl3d.min.js", "plotly").encode()
+    return base64.b64encode(zlib.compress(code, 9)).decode()

@@ -105,14 +105,6 @@ def learned_name(name: str) -> str:
     return f"{title}, {rest.replace('_', ' ')}" if rest else title
 
 
-def stage_name(key: str) -> str:
-    """`diagnosis ibg` as `Diagnosis, Surrogate only`, `surrogate_fit_s` as `Surrogate fit`."""
-    kind, _, name = re.sub(r"_s$", "", key).partition(" ")
-    words = "predictive bands" if kind == "portrait" else kind.replace("_", " ").strip()
-    title = words[:1].upper() + words[1:]
-    return f"{title}, {source_name(name)}" if name in SOURCES else f"{title} {name}".strip()
-
-
 def counted(count: int, what: str) -> str:
     """`1 trajectory`, `5 trajectories`, `3 runs`."""
     several = f"{what[:-1]}ies" if what.endswith("y") else f"{what}s"

@@ -13,12 +13,13 @@ from markupsafe import Markup
 from retwin.report import labels
 from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Section
+from retwin.report.figure import Figure, Matrices
 from retwin.report.glossary import explained
-from retwin.report.png import png, small
 from retwin.report.sections import sections_of
 from retwin.report.study import Study, read_study
 from retwin.report.summary import picture, summary
-from retwin.report.verdict import outcome_of, verdict
+from retwin.report.svg import svg_file
+from retwin.report.verdict import headline, outcome_of, verdict
 from retwin.scores.bootstrap import MIN_RECORDS
 from retwin.scores.comparison import MIN_RUNS
 from retwin.scores.uses import RATE
@@ -48,7 +49,7 @@ FIGURES = (
     "bands",
     "learning",
 )
-"""The files `figures/NAME.png`; of a second source `NAME-2.png`."""
+"""The files `figures/NAME.svg`; of a second source `NAME-2.svg`."""
 PAGES = "https://retwin.readthedocs.io/en/latest/"
 """The documentation."""
 DOCS = f"{PAGES}report.html"
@@ -56,7 +57,7 @@ DOCS = f"{PAGES}report.html"
 
 
 def write_report(folder: str | os.PathLike[str]) -> Path:
-    """Make `report.html` and `figures/*.png` from the results of a study.
+    """Make `report.html` and `figures/*.svg` from the results of a study.
 
     Parameters
     ----------
@@ -81,27 +82,25 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     check_place(figures, folder=True)
     sections = sections_of(study)
     front = picture(study)
-    shown = [each for section in sections for each in (*section.figures, *section.further)]
-    images = {
-        figure.name: png(figure, emulated=study.results.emulated)
-        for figure in (*([front] if front else []), *shown)
-    }
-    for name, image in images.items():
-        with write_atomically(figures / f"{name}.png") as part:
-            part.write_bytes(image)
-    for stale in figures.glob("*.png"):  # of an earlier report, whose results had them
-        if stale.stem not in images and stale.stem.split("-")[0] in FIGURES:
+    shown: list[Figure | Matrices] = [front] if front else []
+    shown += [each for section in sections for each in (*section.figures, *section.further)]
+    for figure in shown:
+        with write_atomically(figures / f"{figure.name}.svg") as part:
+            drawn = svg_file(figure, emulated=study.results.emulated)
+            part.write_text(drawn, encoding="utf-8", newline="\n")
+    names = {figure.name for figure in shown}
+    for stale in figures.glob("*.svg"):  # of an earlier report, whose results had them
+        if stale.stem not in names and stale.stem.split("-")[0] in FIGURES:
             stale.unlink()
     with write_atomically(page) as part:
-        part.write_text(render(study, sections, images), encoding="utf-8", newline="\n")
+        part.write_text(render(study, sections), encoding="utf-8", newline="\n")
     return page
 
 
-def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes]) -> str:
-    """The page as text; `images` take the place of the figures where scripts do not run."""
+def render(study: Study, sections: Sequence[Section]) -> str:
+    """The page as text."""
     units = study.results.outputs.units
-    shown = {name: small(data) for name, data in images.items()}
-    templates = environment(emulated=study.results.emulated, images=shown)
+    templates = environment(emulated=study.results.emulated)
     templates.filters |= {
         "outcome_of": outcome_of,
         "scored": lambda value, metric: labels.scored(value, metric, units),
@@ -109,6 +108,7 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "interval": lambda each: labels.difference(each, units)[1],
     }
     found = summary(study)
+    pair = headline(study.results)
     front = [found["figure"]] if found and found["figure"] else []
     templates.globals |= {
         "results": study.results,
@@ -120,6 +120,8 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "rate": RATE,
         "docs": DOCS,
         "verdict": verdict(study),
+        "own": pair[0] if pair else next(reversed(study.results.sources)),
+        "plain": pair[1] if pair else "",
     }
 
     def fill(name: str, values: Mapping[str, Any]) -> Markup:

@@ -30,7 +30,6 @@ SECTIONS = (
     "learning",
     "explorer",
     "surrogate",
-    "further",
     "time",
     "card",
 )

@@ -38,8 +38,6 @@ def card(study: Study) -> Section:
         "notes": _notes(results),
         "data": _data(study),
         "protocol": results.data.protocol.rstrip("."),
-        "used": results.data.calibration.used,
-        "tested": results.data.test.ids,
         "setup": _setup(study),
         "command": results.provenance.get("command"),
     }

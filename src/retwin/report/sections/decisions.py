@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 from retwin.data.trajectories import HEALTHY
@@ -11,60 +10,37 @@ from retwin.report.blocks import Cell, Section, Table, grouped, tabulate, text_c
 from retwin.report.labels import class_name, distinct, number, percent, percents, source_name
 from retwin.report.study import Study
 from retwin.report.verdict import headline
-from retwin.scores.decisions import Decision, certain_decision, healthy_needed
+from retwin.scores.decisions import Decision, certain_decision
 from retwin.scores.uses import RATE
 
 RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
 """False-alarm rates that the page shows."""
 TRAJECTORIES, FAULTY, MISSED = 1000, 0.02, 50
 """The example: trajectories, share of faulty ones, cost of a missed fault in false alarms."""
-GROUP = f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty"
-DETECTED = ("Faults detected", "Detected at the rate", "of these, correct class")
-"""Heads of columns."""
+HEADS: list[object] = ["Requested false-alarm rate", "Alarm threshold", "Its false alarms"]
+HEADS += ["Faults detected", "Detected at the rate", "of these, correct class"]
+HEADS += [text_column("Most often missed"), text_column("Most often confused")]
+HEADS += grouped(f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty", f"cost, 1 : {MISSED}")
+"""Heads of the table of all rates; that of all sources begins with the fourth."""
 
 
-@dataclass(frozen=True)
-class Alarms:
-    """The decision at the rate that the page chooses.
+def _alarms(study: Study, source: str) -> tuple[float, Decision] | None:
+    """The rate that the page chooses, and the decision at it of the model of the first run.
 
-    Attributes
-    ----------
-    rate : float
-        The chosen false-alarm rate; NaN if the healthy trajectories promise none of `RATES`.
-    decision : Decision
-        None without a rate.
-    certain : bool
-        Whether its false-alarm rate is at most `rate` by its whole interval, or only on average.
-    healthy, needed : int
-        The healthy test trajectories, and how many of them make `rate` certain.
-
-    """
-
-    rate: float
-    decision: Decision | None
-    certain: bool
-    healthy: int
-    needed: int
-
-
-def alarms(study: Study, source: str) -> Alarms | None:
-    """The decision of a source at the rate that the page chooses; None without probabilities.
-
-    A threshold belongs to one model, so it is that of the first run.
+    NaN if the healthy trajectories promise none of `RATES`; None without probabilities of them.
     """
     classes = study.results.classes
     if source not in study.diagnosing or HEALTHY not in classes:
         return None
-    healthy = int(study.healthy.sum())
-    if healthy in (0, len(study.truth)):
+    if study.healthy.all() or not study.healthy.any():
         return None
     first = study.probabilities(source)[0]
     for rate in (each for each in RATES if each >= RATE):
         safe = certain_decision(first, study.truth, classes, rate)
         found = safe or study.decision(source, rate)
         if math.isfinite(found.threshold):
-            return Alarms(rate, found, safe is not None, healthy, healthy_needed(rate))
-    return Alarms(math.nan, None, certain=False, healthy=healthy, needed=healthy_needed(RATE))
+            return rate, found
+    return math.nan, study.decision(source, RATES[-1])
 
 
 def decisions(study: Study) -> Section | None:
@@ -79,58 +55,42 @@ def decisions(study: Study) -> Section | None:
     pair = headline(study.results)
     best = max(sources, key=lambda name: study.sources[name].mean("macro_f1"), default=None)
     best = pair[0] if pair is not None and pair[0] in sources else best
-    chosen = None if best is None else alarms(study, best)
+    chosen = None if best is None else _alarms(study, best)
     if best is None or chosen is None:
         return None
     found = [study.decision(best, rate) for rate in RATES]
     short = [each.requested for each in found if math.isnan(each.threshold)]
-    rate = chosen.decision.guaranteed if chosen.decision else math.nan
+    healthy, (rate, decision) = int(study.healthy.sum()), chosen
+    rate = decision.guaranteed if math.isfinite(rate) else rate
     values = {
         "source": best,
-        "healthy": chosen.healthy,
-        "chosen": chosen,
+        "healthy": healthy,
+        "rate": rate,
+        "chosen": decision,
         "all": None if math.isnan(rate) else _all_sources(study, sources, rate),
         "table": _table(best, [each for each in found if math.isfinite(each.threshold)]),
         "missed": MISSED,
         "lowest": short[-1] if short else None,
         "needed": math.ceil(1 / short[-1]) - 1 if short else 0,
     }
-    scripts = {
-        "calculator": _calculator(study, sources, best, chosen.healthy) | {"rate": 100 * rate}
-    }
+    scripts = {"calculator": _calculator(study, sources, best, healthy) | {"rate": 100 * rate}}
     return Section("decisions", "Decisions", values, scripts=scripts)
 
 
 def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
     """A row per source at the same false-alarm rate."""
-    heads: list[object] = ["Source", *DETECTED, text_column("Most often missed")]
-    heads += grouped(GROUP, f"cost, 1 : {MISSED}")
-    found = {name: study.decision(name, rate) for name in sources}
-    best = max(each.detected for each in found.values())
-    rows = []
-    for name, each in found.items():
-        cost = each.cost(trajectories=TRAJECTORIES, faulty=FAULTY, missed=MISSED)
-        rows.append(
-            [
-                Cell(source_name(name), name, source=name),
-                Cell(percent(each.detected), f"[{percents(each.interval)}]", each.detected == best),
-                percents(each.at_rate),
-                percent(each.identified),
-                class_name(each.most_missed) or "none",
-                number(cost.total, 0),
-            ]
-        )
-    return tabulate("All sources at the same false-alarm rate", heads, rows)
+    rows = [
+        [Cell(source_name(name), source=name), *_row(study.decision(name, rate), 3)[3:]]
+        for name in sources
+    ]
+    return tabulate("All sources at the same false-alarm rate", ["Source", *HEADS[3:]], rows)
 
 
 def _table(source: str, found: list[Decision]) -> Table:
-    heads: list[object] = ["Requested false-alarm rate", "Alarm threshold"]
-    heads += ["Its false alarms", *DETECTED]
-    heads += [text_column("Most often missed"), text_column("Most often confused")]
-    heads += grouped(GROUP, "false alarms", "missed faults", f"cost, 1 : {MISSED}")
     digits = distinct(each.threshold for each in found)
     title = f"Cost of a false-alarm rate, {source_name(source)}"
-    return tabulate(title, heads, [_row(each, digits) for each in found])
+    rows = [_row(each, digits) for each in found]
+    return tabulate(title, HEADS[:6] + HEADS[8:], [[*row[:6], *row[8:]] for row in rows])
 
 
 def _row(each: Decision, digits: int) -> list[object]:
@@ -144,8 +104,6 @@ def _row(each: Decision, digits: int) -> list[object]:
         percent(each.identified),
         class_name(each.most_missed) or "none",
         " as ".join(map(class_name, each.most_confused)) or "none",
-        number(cost.false_alarms, 0),
-        number(cost.missed_faults, 1),
         number(cost.total, 0),
     ]
 

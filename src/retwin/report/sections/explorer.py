@@ -41,6 +41,7 @@ def explorer(study: Study) -> Section | None:
     content = _content(study, overlay)
     values = {
         "keys": keys,
+        "source": overlay.source,
         "latent": content["latent"] is not None,
         "pose": content["pose"] is not None,
         "pose_keys": _pose_keys(content["pose"] or {}, overlay.source),

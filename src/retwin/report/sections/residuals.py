@@ -55,6 +55,7 @@ def residuals(study: Study) -> Section | None:
     values = {
         "table": _table(study, known, errors, commands, outside),
         "figures": {each.name: each for each in figures},
+        "best": min(known, key=lambda name: study.sources[name].mean("nrmse")),
         "limited": len(errors) > OUTPUTS or len(commands) > COMMANDS,
         "ranged": "simulation/range" in study.arrays,
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +19,6 @@ from retwin.report.labels import (
     mean_and_deviation,
     metric_name,
     metric_quantity,
-    number,
     real_data,
     source_name,
     span,
@@ -37,7 +35,7 @@ def scores(study: Study) -> Section | None:
     shown = [name for name in MAIN if study.results.has(name)]
     if not shown:
         return None
-    values = table_values(study, shown, "Scores of all sources")
+    values = _table(study, shown)
     if not study.results.classes:
         table = values["table"]
         costs = [Cell(duration(source.update_s)) for source in study.sources.values()]
@@ -47,20 +45,17 @@ def scores(study: Study) -> Section | None:
     drawn = [name for name in shown if not (many and study.results.classes) or name in SELECTED]
     drawn = [name for name in drawn if METRICS[name].better > 0]
     figures = [_figure(study, drawn)] if drawn else []
-    published = any(key.mark == "diamond-open" for figure in figures for key in figure.keys)
-    values |= {"figure": next(iter(figures), None), "published": published}
+    values["figure"] = next(iter(figures), None)
     return Section("scores", "Scores", values, figures)
 
 
-def table_values(
-    study: Study, metrics: Sequence[str], title: str, floors: dict[str, float | None] | None = None
-) -> dict[str, Any]:
+def _table(study: Study, metrics: Sequence[str]) -> dict[str, Any]:
     """A row per source, and what the caption states of it."""
     results = study.results
     paper = any(_in_paper(results, name) for name in metrics)
     shown = {name: metric_quantity(name, results.outputs.units) for name in metrics}
-    heads = ["Training data" if results.classes else "Source", *(["ECE floor"] if floors else [])]
-    heads[1:1] = [with_unit(metric_name(name), unit) for name, (_, unit) in shown.items()]
+    heads = ["Training data" if results.classes else "Source"]
+    heads += [with_unit(metric_name(name), unit) for name, (_, unit) in shown.items()]
     best = {name: _best(results, name) for name in metrics}
     rows = []
     for name, source in study.sources.items():
@@ -74,12 +69,11 @@ def table_values(
             published = results.published.get(name, {}).get(metric, "")
             text, leads = mean_and_deviation(values), name in best[metric]
             row.append(Cell(text, below, best=leads, paper=published))
-        rows.append([*row, number(floors[name])] if floors else row)
+        rows.append(row)
     return {
-        "table": tabulate(title, heads, rows),
+        "table": tabulate("Scores of all sources", heads, rows),
         "paper": paper,
         "intervals": any(source.intervals for source in study.sources.values()),
-        "protocol_known": any(source.fault_protocol_known for source in study.sources.values()),
     }
 
 
@@ -108,17 +102,6 @@ def _figure(study: Study, metrics: Sequence[str]) -> Figure:
     keys = [Key(source_name(name), colour_of(name), symbol(name)) for name in sources]
     for name, source in sources.items():
         marks.append(_points(name, source, metrics, lanes[name]))
-        texts = study.results.published.get(name, {})
-        known = {m: each for m in metrics if (each := _published(texts.get(m, "")))}
-        if known:
-            means = [mean for mean, _ in known.values()]
-            title, look = f"{source_name(name)} (paper)", (colour_of(name), "diamond-open")
-            heights = [metrics.index(m) + lanes[name] + 0.35 * width for m in known]
-            ends = [(mean - deviation, mean + deviation) for mean, deviation in known.values()]
-            shown = list(map(number, means))
-            marks.append(Points(means, heights, title, *look, ends, texts=shown, bar_width=1))
-    if len(marks) > len(metrics) + len(sources):
-        keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond-open"))
     ticks = {
         place + lane: source_name(name)
         for place in range(len(metrics))
@@ -149,9 +132,3 @@ def _points(name: str, source: SourceResults, metrics: Sequence[str], lane: floa
         texts=[f"{mean_and_deviation(source.runs(m))} [{span(source.interval(m))}]" for m in shown],
         size=10,
     )
-
-
-def _published(text: str) -> tuple[float, float] | None:
-    """Mean and deviation from a text like `0.753 ± 0.026`; None if it is no score."""
-    found = re.fullmatch(r"\s*([01]?\.\d+)\s*(?:±\s*([01]?\.\d+))?\s*", text)
-    return (float(found[1]), float(found[2] or 0)) if found else None

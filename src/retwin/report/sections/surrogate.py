@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from retwin.report.blocks import Section, tabulate
-from retwin.report.labels import number, quantity, with_unit
+from retwin.report.labels import behind, number, quantity, with_unit
 from retwin.report.sections.discrepancy import latents
 from retwin.report.study import Study
 
@@ -21,5 +21,7 @@ def surrogate(study: Study) -> Section | None:
         both = number(factor * value), number(None if relative is None else 100 * relative, 2)
         rows.append([name, *both][: len(heads)])
     compared = any(latents(study, source) for source in study.results.fidelity)
-    values = {"table": tabulate("Error of the surrogate", heads, rows), "compared": compared}
+    worst = behind(number(factor * max(error.rmse.values())), unit)
+    table = tabulate("Error of the surrogate", heads, rows)
+    values = {"table": table, "compared": compared, "worst": worst}
     return Section("surrogate", "Surrogate error", values)

@@ -1,12 +1,11 @@
-"""The costs of each source in twin runs and seconds, and the duration of the stages."""
+"""The costs of each source in twin runs and seconds."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 
-from retwin.report.blocks import Cell, Column, Section, Table, tabulate, text_column
-from retwin.report.labels import duration, real_data, source_name, stage_name
+from retwin.report.blocks import Cell, Section, Table, tabulate, text_column
+from retwin.report.labels import duration, real_data, source_name
 from retwin.report.study import Study
 from retwin.source_results import SourceResults
 
@@ -15,27 +14,11 @@ PUBLISHED_BULK, BULK = 3600, 1000
 
 
 def time(study: Study) -> Section | None:
-    """The costs of the sources, and the duration of the stages."""
-    costs, stages = _costs(study), _stages(study)
-    if costs is None and stages is None:
+    """The costs of the sources."""
+    costs = _costs(study)
+    if costs is None:
         return None
-    paper = costs is not None and any(column.paper for column in costs.columns)
-    return Section("time", "Time", {"costs": costs, "stages": stages, "paper": paper})
-
-
-def _stages(study: Study) -> Table | None:
-    timing = study.results.timing
-    seconds = timing.get("seconds")
-    named = {
-        **{stage_name(key): value for key, value in (seconds or {}).items()},
-        "All jobs": timing.get("total_s"),
-    }
-    rows = [
-        [name, duration(float(value))]
-        for name, value in named.items()
-        if isinstance(value, int | float) and math.isfinite(value)
-    ]
-    return tabulate("Time of the stages", ["Stage", "Time"], rows) if rows else None
+    return Section("time", "Time", {"costs": costs})
 
 
 def _costs(study: Study) -> Table | None:
@@ -58,12 +41,6 @@ def _costs(study: Study) -> Table | None:
     names = [Cell(source_name(source), source=source) for source in study.sources]
     used = [real_data(each.real_data, classes=classes) for each in study.sources.values()]
     found: list[Sequence[object]] = [names, used]
-    published = [study.results.published.get(s, {}).get("generate", "–") for s in study.sources]
-    for name, texts in kept.items():
-        if name == bulk and set(published) != {"–"}:
-            heads += [Column("this study", group=bulk), Column("paper", group=bulk, paper=True)]
-            found += [texts, published]
-        else:
-            heads.append(name)
-            found.append(texts)
+    heads += kept
+    found += kept.values()
     return tabulate("Cost of a source in one run", heads, zip(*found, strict=True))

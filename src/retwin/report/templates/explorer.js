@@ -10,9 +10,7 @@ const explorer = async (place) => {
   }
   // See `packed` in explorer.py.
   const unpack = async (packed) => {
-    const bytes = Uint8Array.from(atob(packed.codes), (sign) => sign.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-    const plane = new Uint8Array(await new Response(stream).arrayBuffer());
+    const plane = new Uint8Array(await page.inflate(packed.codes));
     const count = plane.length / 2;
     const stride = packed.shape.slice(packed.axis + 1).reduce((a, b) => a * b, 1);
     const length = packed.shape[packed.axis];

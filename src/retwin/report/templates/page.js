@@ -41,16 +41,27 @@ const page = (() => {
     displaylogo: false, scrollZoom: false, displayModeBar: root.clientWidth < 600 ? false : "hover",
     toImageButtonOptions: { format: "png", scale: 2 },
   };
-  // The plot library is most of the page's script: it is run when the first plot is drawn.
-  const library = () => {
-    if (!window.Plotly) {
-      const run = document.createElement("script");
-      run.textContent = document.getElementById("plotly").textContent;
-      document.head.append(run);
-    }
-    return window.Plotly;
+  // Bytes from deflated ones in base 64.
+  const inflate = async (text) => {
+    const bytes = Uint8Array.from(atob(text), (sign) => sign.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+    return new Response(stream).arrayBuffer();
+  };
+  // The plot library is most of the page's script: it is unpacked when the first plot is drawn.
+  // Until then, and in browsers that cannot unpack it, the page shows its pictures.
+  let loading = null;
+  const load = async () => {
+    const code = await inflate(document.getElementById("plotly").textContent);
+    const run = document.createElement("script");
+    run.textContent = new TextDecoder().decode(code);
+    document.head.append(run);
   };
   const plot = (place, data, layout) => {
+    if (window.Plotly) react(place, data, layout);
+    else if (window.DecompressionStream) (loading ||= load()).then(() => react(place, data, layout));
+  };
+  const react = (place, data, layout) => {
+    if (!place.data) place.replaceChildren();
     const style = getComputedStyle(root);
     const height = layout.height * (root.dataset.print ? 0.72 : 1);
     place.style.height = height + "px";
@@ -58,7 +69,7 @@ const page = (() => {
     const buttons = data.some((each) => each.type === "scatter3d")
       ? ["toImage", "orbitRotation", "zoom3d", "pan3d", "resetCameraDefault3d"]
       : ["toImage", "zoom2d", "pan2d", "resetScale2d"];
-    library().react(place, { data: paint(data, style), layout: painted, config: { ...config, modeBarButtons: [buttons] } });
+    Plotly.react(place, { data: paint(data, style), layout: painted, config: { ...config, modeBarButtons: [buttons] } });
   };
   const visible = (place) => !place.closest("details.part:not([open])");
   // The function that draws an element, called when that is near the screen; closed sections never are.
@@ -138,5 +149,5 @@ const page = (() => {
     redraw();
   });
 
-  return { axis, escaped, layout, near, plot, visible };
+  return { axis, escaped, inflate, layout, near, plot, visible };
 })();
