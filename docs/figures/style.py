@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from retwin.report.png import blank, dress
 from retwin.report.style import PALETTE, hexadecimal
 
 __all__ = [
@@ -35,25 +35,6 @@ IMAGES = Path(__file__).parents[1] / "images"
 BLUE, ORANGE, GREEN, PINK = (light for light, _ in PALETTE[:4])
 COLOURS = 128
 """Colours of a file, which keeps it small."""
-
-
-def blank(width: float, height: float) -> Figure:
-    """A white canvas of this size in inches."""
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def dress(axes: Axes, x: str, y: str) -> None:
-    """Label both axes in the page's style."""
-    axes.set_xlabel(x, color=MUTED)
-    axes.set_ylabel(y, color=MUTED)
-    axes.tick_params(colors=MUTED, labelsize=9)
-    axes.grid(color=hexadecimal("grid"), linewidth=0.8)
-    axes.set_axisbelow(True)
-    for name, spine in axes.spines.items():
-        spine.set_color(RULE)
-        spine.set_visible(name in ("left", "bottom"))
 
 
 def title(axes: Axes, text: str) -> None:

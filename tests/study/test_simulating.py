@@ -213,7 +213,8 @@ def test_sections_that_need_labels_disappear(folder: Path) -> None:
     assert ">RMSE</abbr>, mm</th>" in page
     assert "No verdict, since a verdict over records needs at least 8 of them" in page
     assert "other stretches of the same test records" in page
-    assert (folder / "figures" / "simulation.svg").exists()
+    assert rt.write_report(folder, figures=True).read_text("utf-8") == page
+    assert (folder / "figures" / "simulation.png").exists()
 
 
 @pytest.mark.slow

@@ -109,7 +109,7 @@ def map_log(
     from retwin.report.log_picture import log_picture
 
     ends_in("--out", out, (".toml",), remedy="give another name, such as mapping.toml")
-    picture = out.with_suffix(".svg")
+    picture = out.with_suffix(".png")
     for place in (out, picture):
         check_place(place)
     if rate is not None:
@@ -125,7 +125,7 @@ def map_log(
         )
         parts = tried(made.log, made.mapping, case=system)
         drawn = log_picture(made.log, parts)
-    for place, contents in ((out, made.text.encode()), (picture, drawn.encode())):
+    for place, contents in ((out, made.text.encode()), (picture, drawn)):
         with write_atomically(place) as part:
             part.write_bytes(contents)
     remarks = _remarks(made, parts)

@@ -125,11 +125,12 @@ def study(
 
 def report(
     folder: Annotated[Path, argument("STUDY", "Folder of a study.")],
+    figures: Annotated[bool, option("", "Also figures/*.png, for a paper.", "--figures")] = False,
 ) -> None:
     """Write the report page again from a study's results."""
     from retwin.report import write_report
 
-    page = write_report(folder)
+    page = write_report(folder, figures=figures)
     answer(page, str(page))
 
 

@@ -21,7 +21,6 @@ from retwin.report import labels
 from retwin.report.figure import Figure, Matrices
 from retwin.report.plotly_specs import figure_specs
 from retwin.report.style import CHROME, PALETTE, colour_of, symbol
-from retwin.report.svg import svg_panel
 
 LABELS = {name: each for name, each in vars(labels).items() if isinstance(each, FunctionType)}
 """The filters of all templates, under their own names."""
@@ -48,7 +47,6 @@ def environment(*, emulated: bool = False) -> Environment:
     made.tests["finite"] = isfinite
     made.globals |= {
         "emulated": emulated,
-        "drawing": lambda panel, width: Markup(svg_panel(panel, width)),
         "anchors": set(),
         "colour_of": colour_of,
         "symbol": symbol,

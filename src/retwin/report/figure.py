@@ -262,14 +262,14 @@ def record_panel(times: NDArray, name: str, unit: str, marks: Sequence[Mark]) ->
     return Panel(x, [Row(Axis(name, unit), marks)], f"{name} over time", name, height=300)
 
 
-def envelope(mark: Mark, points: int = MAX_POINTS) -> Mark:
+def envelope(mark: Mark) -> Mark:
     """A line or a band of very many samples as its extremes in groups, so that no peak is lost."""
-    if not isinstance(mark, Line | Band) or len(np.asarray(mark.x)) <= points:
+    if not isinstance(mark, Line | Band) or len(np.asarray(mark.x)) <= MAX_POINTS:
         return mark
     x = np.asarray(mark.x, dtype=float)
     if np.any(np.diff(x) < 0):
         return mark
-    starts = np.linspace(0, len(x), points // 2 + 1).astype(int)[:-1]
+    starts = np.linspace(0, len(x), MAX_POINTS // 2 + 1).astype(int)[:-1]
 
     def extremes(least: ArrayLike, greatest: ArrayLike) -> list[NDArray]:
         pairs = ((np.fmin, least), (np.fmax, greatest))

@@ -9,7 +9,7 @@ from retwin.data.logs.mapped import Parts
 from retwin.data.logs.signals import Log
 from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, Spans
 from retwin.report.labels import counted
-from retwin.report.svg import svg_file
+from retwin.report.png import png
 
 MAX_ROWS = 16
 """Signals that are drawn at most."""
@@ -22,8 +22,8 @@ KEYS = (
 )
 
 
-def log_picture(log: Log, tried: Parts | str) -> str:
-    """The signals of a log as SVG, above each other, with the trajectories that a mapping makes.
+def log_picture(log: Log, tried: Parts | str) -> bytes:
+    """The signals of a log as PNG, above each other, with the trajectories that a mapping makes.
 
     Trajectories are shaded, and their samples are drawn over the values of the log. Samples that
     are missing are marked in red below the signal.
@@ -65,7 +65,7 @@ def log_picture(log: Log, tried: Parts | str) -> str:
     title = f"{log.name}: {title}"
     title = title if len(title) < 100 else title[:99] + "…"
     keys = () if isinstance(tried, str) else KEYS
-    return svg_file(Figure("log", panels, keys, columns=1, title=title), emulated=False)
+    return png(Figure("log", panels, keys, columns=1, title=title), emulated=False)
 
 
 def _marks(parts: Parts, column: int) -> list[Mark]:

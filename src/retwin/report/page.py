@@ -18,7 +18,6 @@ from retwin.report.glossary import explained
 from retwin.report.sections import sections_of
 from retwin.report.study import Study, read_study
 from retwin.report.summary import picture, summary
-from retwin.report.svg import svg_file
 from retwin.report.verdict import headline, outcome_of, verdict
 from retwin.scores.bootstrap import MIN_RECORDS
 from retwin.scores.comparison import MIN_RUNS
@@ -49,20 +48,23 @@ FIGURES = (
     "bands",
     "learning",
 )
-"""The files `figures/NAME.svg`; of a second source `NAME-2.svg`."""
+"""The files `figures/NAME.png`; of a second source `NAME-2.png`."""
 PAGES = "https://retwin.readthedocs.io/en/latest/"
 """The documentation."""
 DOCS = f"{PAGES}report.html"
 """The documentation of the page, to which each section links."""
 
 
-def write_report(folder: str | os.PathLike[str]) -> Path:
-    """Make `report.html` and `figures/*.svg` from the results of a study.
+def write_report(folder: str | os.PathLike[str], *, figures: bool = False) -> Path:
+    """Make `report.html` from the results of a study, and `figures/*.png` if they are asked for.
 
     Parameters
     ----------
     folder : path
         The folder of the study, to which the report goes as well.
+    figures : bool
+        Whether the figures of the page are also written as files. Those of an earlier report are
+        removed otherwise, since they may show other results.
 
     Returns
     -------
@@ -77,20 +79,23 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
 
     """
     study = read_study(folder)
-    page, figures = Path(folder) / "report.html", Path(folder) / "figures"
+    page, pictures = Path(folder) / "report.html", Path(folder) / "figures"
     check_place(page)
-    check_place(figures, folder=True)
+    check_place(pictures, folder=True)
     sections = sections_of(study)
-    front = picture(study)
-    shown: list[Figure | Matrices] = [front] if front else []
-    shown += [each for section in sections for each in (*section.figures, *section.further)]
-    for figure in shown:
-        with write_atomically(figures / f"{figure.name}.svg") as part:
-            drawn = svg_file(figure, emulated=study.results.emulated)
-            part.write_text(drawn, encoding="utf-8", newline="\n")
-    names = {figure.name for figure in shown}
-    for stale in figures.glob("*.svg"):  # of an earlier report, whose results had them
-        if stale.stem not in names and stale.stem.split("-")[0] in FIGURES:
+    written: set[str] = set()
+    if figures:
+        from retwin.report.png import png  # imports matplotlib, which takes a second
+
+        front = picture(study)
+        drawn: list[Figure | Matrices] = [front] if front else []
+        drawn += [each for section in sections for each in (*section.figures, *section.further)]
+        for figure in drawn:
+            written.add(figure.name)
+            with write_atomically(pictures / f"{figure.name}.png") as part:
+                part.write_bytes(png(figure, emulated=study.results.emulated))
+    for stale in pictures.glob("*.png"):
+        if stale.stem not in written and stale.stem.split("-")[0] in FIGURES:
             stale.unlink()
     with write_atomically(page) as part:
         part.write_text(render(study, sections), encoding="utf-8", newline="\n")

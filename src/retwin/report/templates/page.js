@@ -48,7 +48,6 @@ const page = (() => {
     return new Response(stream).arrayBuffer();
   };
   // The plot library is most of the page's script: it is unpacked when the first plot is drawn.
-  // Until then, and in browsers that cannot unpack it, the page shows its pictures.
   let loading = null;
   const load = async () => {
     const code = await inflate(document.getElementById("plotly").textContent);
@@ -59,6 +58,7 @@ const page = (() => {
   const plot = (place, data, layout) => {
     if (window.Plotly) react(place, data, layout);
     else if (window.DecompressionStream) (loading ||= load()).then(() => react(place, data, layout));
+    else place.textContent = "This figure requires a browser of 2023 or later.";
   };
   const react = (place, data, layout) => {
     if (!place.data) place.replaceChildren();
