@@ -203,6 +203,7 @@ def _replay_trajectories(
 ) -> None:
     """Watch recorded trajectories of one machine, file after file."""
     from retwin.monitor import TrajectoryMonitor
+    from retwin.monitor.live.sentences import REMEDY
 
     made, system, state = TrajectoryMonitor.load(monitor), case_named(case), None
     rows, found, texts = [], [], []
@@ -228,7 +229,7 @@ def _replay_trajectories(
         )
         texts.append(
             f"{file.name}: {len(watched.alarms)} alarms in {len(record)} trajectories"
-            + (f"; the promise is VOID in {void}: calibrate again" if void else "")
+            + (f"; the promise is VOID in {void}. {REMEDY}" if void else "")
             + "".join(f"; {each}" for each in watched.remarks)
             + "."
         )
@@ -349,8 +350,8 @@ def recalibrate(
     asset: Annotated[str, option("NAME", "The machine.")],
     hours: Annotated[float, option("H", "Newest hours of which quiet ones are used.")] = 24.0,
     new_normal: Annotated[
-        bool, option("", "A change that lasts is no fault but the new normal.", "--new-normal")
-    ] = False,
+        str, option("NAME", "You, if a change that lasts is no fault but the new normal.")
+    ] = "",
     url: Annotated[str, rare("URL", "The PostgreSQL database, if one.")] = "",
     as_json: Json = False,
 ) -> None:
@@ -448,7 +449,7 @@ def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
             + (
                 "Look for the causes of the events first: a calibration with this record would "
                 "take the fault for healthy"
-                if events
+                if watched.events
                 else "If it is healthy, calibrate with this record too"
             )
         )
