@@ -20,7 +20,7 @@ from retwin.monitor.detect.slack import Slack
 from retwin.monitor.live.machine import Counts
 from retwin.monitor.live.status import AssetStatus
 from retwin.monitor.live.stream_machine import BEHIND, TOLERATED, WINDOW, StreamMachine, Work
-from retwin.monitor.live.trajectory_machine import TrajectoryMachine
+from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.models import cause, trajectories, visibility
 from retwin.monitor.models.cause import MIN_WINDOW, PROBABLE, cause_text
 from retwin.monitor.models.fitting import fit_monitor
@@ -239,6 +239,13 @@ def test_a_place_is_waited_for_as_long_as_is_set(wait: float, last: float, done:
     assert stream.machine._done == done
 
 
+def test_stored_samples_are_held_from_the_first_that_was_not_stepped() -> None:
+    stream = Stream()
+    stream.give(100, 101)
+    stream.machine.hold(np.array([101, 102, 104]) * SECOND, np.ones((3, 2)))
+    assert list(stream.machine._pending) == [2, 4]
+
+
 @pytest.mark.parametrize(("pause", "anew"), [(3600, False), (3601, True)])
 def test_a_stream_begins_anew_after_the_longest_gap(pause: int, anew: bool) -> None:
     stream = Stream()
@@ -251,6 +258,10 @@ def test_a_first_sample_is_late_where_a_newer_or_the_same_one_is_stored() -> Non
         stream = Stream()
         stream.machine.newest = newest * SECOND
         assert stream.give(100) == what
+    stream = Stream()
+    stream.give(100, 101)
+    stream.machine.committed()
+    assert stream.give(101) == "late"  # the newest one again, which the store was not asked for
 
 
 @pytest.mark.parametrize(("late", "logged"), [(BEHIND - 1, 0), (BEHIND, 1), (BEHIND + 1, 1)])
@@ -345,6 +356,24 @@ def test_what_is_done_with_a_trajectory(begin: int, limit: int, known: set[int],
     machine = SimpleNamespace(newest=10, monitor=SimpleNamespace(twin=twin))
     given = Trajectory("a", begin, np.ones((2, 2)))
     assert TrajectoryMachine.placed(machine, given, limit, known) == what  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "logged"),
+    [(False, False, []), (False, True, ["void"]), (True, True, [])],
+)
+def test_a_promise_about_trajectories_that_becomes_void_is_logged_once(
+    before: bool, now: bool, logged: list[str]
+) -> None:
+    state = SimpleNamespace(arrays=dict)
+    machine = TrajectoryMachine(Asset("a", 2, {}, 1), SimpleNamespace(start=lambda: state))  # type: ignore[arg-type]
+    machine.void = before
+    no = np.array([False])
+    flags = dict.fromkeys(("unmeasured", "unranked", "implausible", "outside"), no)
+    watched = SimpleNamespace(alarms=[], void=np.array([now]), evidence=np.zeros(1), **flags)
+    samples = Samples("a", np.arange(2), np.ones((2, 2)))
+    found = Diagnosed(samples, state, watched)  # type: ignore[arg-type]
+    assert [kind for kind, _ in machine.update(found)[1]] == logged
 
 
 def of_trajectories(**changes: Any) -> TrajectoryMonitor:
