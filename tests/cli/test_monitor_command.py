@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.cli.monitor import _written
+from retwin.cli.monitor import _alarm_causes, _written
 from retwin.monitor import Alarm
 from retwin.monitor.models.cause import Cause
-from retwin.twins import ParameterShift
+from retwin.twins import ParameterShift, SensorBias
 from retwin.update import DynamicsTwin
 
 
@@ -140,3 +141,12 @@ def test_trajectories_are_watched_by_a_diagnoser(watched: Path, call, tmp_path: 
     assert (leaking["alarms"][0]["number"], leaking["alarms"][0]["name"]) == (13, "leaking")
     code, printed, _ = call(*replayed, tmp_path / "leak.npz")
     assert "healthy.npz: 0 alarms in 13 trajectories." in printed
+
+
+def test_causes_of_a_case_are_not_those_of_a_black_box() -> None:
+    causes = {"leak": ParameterShift("drain", size=0.5), "offset": SensorBias(0, size=0.1)}
+    for parameter, expected in (("drain", causes), ("level[k-1]", None)):
+        own = SimpleNamespace(parameters=(SimpleNamespace(name=parameter),))
+        system, twin = SimpleNamespace(alarm_causes=causes), SimpleNamespace(equations=own)
+        assert _alarm_causes(system, twin) == expected  # type: ignore[arg-type]
+    assert _alarm_causes(None, twin) is None  # type: ignore[arg-type]

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from retwin.monitor.detect import promise
 from retwin.monitor.detect.detector import Detector
 from retwin.monitor.detect.events import CERTAIN, Course, Rules
+from retwin.monitor.detect.predictors import IMPLAUSIBLE, Predictor, agreeing, implausible
 from retwin.monitor.detect.promise import SIGNIFICANCE, FalseAlarmTest, Tried, shortest
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.detect.validity import Validity
@@ -37,6 +42,15 @@ def test_an_event_needs_as_many_samples_as_show_a_shift_of_one_deviation() -> No
         True,
     ]
     assert not RULES.ends(course(), np.zeros((1, 9)), np.ones((1, 9), dtype=bool)).any()
+    unseen = RULES.ends(course(event=90, quiet=9), np.zeros((1, 1)), np.zeros((1, 1), dtype=bool))
+    assert not unseen.any()  # an event ends with a sample that is measured
+
+
+def test_an_event_of_the_first_sample_is_one() -> None:
+    yes, no, counted = np.array([True]), np.array([False]), np.ones((1, 1), dtype=bool)
+    assert RULES.ends(course(event=0, quiet=9), np.zeros((1, 1)), counted).all()
+    assert RULES.changes(course(event=0), 1).all()
+    assert RULES.after(course(event=0), counted, yes, no, no).event[0] == 0
 
 
 def test_an_event_does_not_end_while_there_is_evidence() -> None:
@@ -77,6 +91,48 @@ def test_a_promise_is_void_at_its_evidence_and_not_below() -> None:
     ]
 
 
+def test_a_block_without_an_alarm_is_evidence_once_it_is_full() -> None:
+    validity = Validity(Detector(Slack()), 1000.0, block=5)
+    for steps, blocks in ((4, 0), (5, 1), (6, 1)):
+        state, _ = validity.run(validity.start(1), np.zeros((1, steps)), np.zeros((1, steps)))
+        assert state.blocks[0] == blocks
+    rare = validity.start(1)
+    rare = replace(rare, products=1e6 * rare.products, samples=np.array([4.0]))
+    for alarm, evidence in ((True, 0.5), (False, 1.0)):  # it doubles that of a block, at most
+        state, _ = validity.run(rare, np.array([[alarm]]), np.zeros((1, 1)))
+        assert state.quiet[0] == pytest.approx(evidence)
+
+
+@pytest.mark.parametrize(("share", "widened"), [(0.99, False), (1.0, True), (2.0, True)])
+def test_a_slack_is_widened_where_evidence_reaches_its_limit(
+    monkeypatch: pytest.MonkeyPatch, share: float, widened: bool
+) -> None:
+    limit = 10 * 1 / 0.05  # samples, of one part
+
+    def run(detector: Detector, state: object, low: np.ndarray, high: np.ndarray) -> object:
+        evidence = share * limit if detector.slack[0] == Slack() else 0.0  # type: ignore[index]
+        return state, np.full(low.shape, evidence)
+
+    monkeypatch.setattr(Detector, "run", run)
+    scores = np.zeros((1, 10))
+    assert (agreeing((Slack(),), [(scores, scores)]) != (Slack(),)) is widened
+
+
+def test_the_samples_of_the_warm_up_are_not_used() -> None:
+    used = Predictor(warm_up=3.0).used(np.array([0, 2]), 4, 1.0)
+    assert used.tolist() == [[False, False, False, True], [False, True, True, True]]
+
+
+@pytest.mark.parametrize("below", [True, False])
+def test_a_command_is_implausible_beyond_a_hundred_ranges(below: bool) -> None:
+    domain = SimpleNamespace(low=np.array([-2.0]), high=np.array([1.0]))
+    twin = SimpleNamespace(process=(), domain=domain)
+    far = IMPLAUSIBLE * 3.0
+    limit = -2.0 - far if below else 1.0 + far
+    given = np.array([limit, np.nextafter(limit, 2 * limit), 2 * limit]).reshape(1, 3, 1)
+    assert implausible(twin, given)[0, :, 0].tolist() == [False, True, True]  # type: ignore[arg-type]
+
+
 def test_the_rate_of_records_left_out_has_the_exact_bound() -> None:
     assert shortest(0, 3.0) == pytest.approx(3.0 / 2.9957, rel=1e-4)
     assert shortest(2, 3.0) == pytest.approx(3.0 / 6.2958, rel=1e-4)
@@ -90,11 +146,16 @@ def test_the_rate_of_records_left_out_has_the_exact_bound() -> None:
     assert "1 of them in b" in one.text(1.0)
 
 
-def test_a_version_is_better_above_zero_and_with_alarms_as_promised() -> None:
+def test_a_version_is_better_above_zero_and_with_alarms_as_promised(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     passed = FalseAlarmTest(0, 100, 1000.0)
     limit = Decision(1.0, 1.0, 0.0, 0.0, 0.1, passed)
     assert not limit.better
     assert Decision(1.0, 1.0, 0.0, 1e-9, 0.1, passed).better
+    monkeypatch.setattr(promise, "SIGNIFICANCE", passed.p)
+    assert passed.passed  # at the limit
+    monkeypatch.undo()
     broken = FalseAlarmTest(3, 100, 1000.0)
     assert broken.p < SIGNIFICANCE
     assert not Decision(1.0, 0.5, 0.5, 0.4, 0.6, broken).better

@@ -76,16 +76,31 @@ def test_too_short_a_quiet_time_is_refused(tmp_path: Path, folder: Path) -> None
             recalibrate(store, "b")
 
 
+def test_two_parts_that_can_be_compared_are_enough(tmp_path: Path, folder: Path) -> None:
+    for samples, enough in ((319, False), (320, True)):
+        record = recorded(5, 340)[:].between(0.0, float(samples))
+        with watched(tmp_path / str(samples), folder, record) as store:
+            if enough:
+                assert recalibrate(store, "a").state == "shadow"
+            else:
+                with pytest.raises(InputError, match="at least 320 s"):
+                    recalibrate(store, "a")
+
+
 def test_an_event_that_lasts_needs_the_word_that_it_is_normal(tmp_path: Path, folder: Path) -> None:
     store = watched(tmp_path / "s", folder, recorded(5, 1600, slice(600, None)))
-    with store, pytest.raises(InputError, match="new normal"):
+    with store, pytest.raises(InputError, match="new normal") as error:
         recalibrate(store, "a")
+    # What is known of the event is stated where somebody has to decide what it is.
+    assert "an event that lasts: a: ALARM" in str(error.value)
+    assert "level, higher than predicted (2023-11-14T22:23:2" in str(error.value)
     refused = CliRunner().invoke(app, ["recalibrate", str(tmp_path / "s"), "--asset=a"])
     assert isinstance(refused.exception, InputError)
     done = CliRunner().invoke(
-        app, ["recalibrate", str(tmp_path / "s"), "--asset", "a", "--new-normal"]
+        app, ["recalibrate", str(tmp_path / "s"), "--asset", "a", "--new-normal", "Ada"]
     )
     assert done.exit_code == 0, done.output
     with Store(tmp_path / "s", read_only=True) as store:
+        assert Registry(store, "tank").versions()[1].reason.endswith("a new normal as Ada says")
         made = Monitor.load(Registry(store, "tank").folder(2))
         assert 800 < sum(made.tried.samples.values()) <= 1000  # those since the change alone

@@ -79,7 +79,7 @@ def test_an_alarm_has_a_cause_and_is_acknowledged(client: httpx.Client, server: 
     assert first["cause"]["unit"] == "1/s"
     low, high = first["cause"]["onset"][1:]
     assert low - 5 <= BEGIN + 200 <= high + 5
-    assert "The parameter drain" in first["cause"]["check"]
+    assert "parameter drain" in first["cause"]["check"]
     around = client.get(f"/alarms/{first['sequence']}/samples").json()
     assert around["times"][0] < first["time"] < around["times"][-1]
     path = f"/alarms/{whole[0]['sequence']}/acknowledge"  # the newest, and so all before it

@@ -8,7 +8,7 @@ import signal
 import tempfile
 import threading
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
@@ -42,6 +42,7 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
     from retwin.cases.twin_data import TwinData
     from retwin.monitor import Alarm, Cause, Monitor, Watched
+    from retwin.twins.faults.actuator_faults import Fault
     from retwin.update import DynamicsTwin
 
 EVENT = ("file", "record", "from s", "to s", "what", "cause")
@@ -108,7 +109,7 @@ def fit(
             known, given, false_alarms, lasting=3600.0 if lasting is None else lasting
         )
         show("faults that are seen", 0.5)
-        causes = possible_causes(made.twin, system.alarm_causes if system else None)
+        causes = possible_causes(made.twin, _alarm_causes(system, made.twin))
         made = replace(made, visible=tuple(visible_sizes(made, given, causes)))
     made.save(out)
     twin = made.twin
@@ -203,6 +204,7 @@ def _replay_trajectories(
 ) -> None:
     """Watch recorded trajectories of one machine, file after file."""
     from retwin.monitor import TrajectoryMonitor
+    from retwin.monitor.live.sentences import REMEDY
 
     made, system, state = TrajectoryMonitor.load(monitor), case_named(case), None
     rows, found, texts = [], [], []
@@ -228,7 +230,7 @@ def _replay_trajectories(
         )
         texts.append(
             f"{file.name}: {len(watched.alarms)} alarms in {len(record)} trajectories"
-            + (f"; the promise is VOID in {void}: calibrate again" if void else "")
+            + (f"; the promise is VOID in {void}. {REMEDY}" if void else "")
             + "".join(f"; {each}" for each in watched.remarks)
             + "."
         )
@@ -349,8 +351,8 @@ def recalibrate(
     asset: Annotated[str, option("NAME", "The machine.")],
     hours: Annotated[float, option("H", "Newest hours of which quiet ones are used.")] = 24.0,
     new_normal: Annotated[
-        bool, option("", "A change that lasts is no fault but the new normal.", "--new-normal")
-    ] = False,
+        str, option("NAME", "You, if a change that lasts is no fault but the new normal.")
+    ] = "",
     url: Annotated[str, rare("URL", "The PostgreSQL database, if one.")] = "",
     as_json: Json = False,
 ) -> None:
@@ -397,10 +399,20 @@ def _causes(
 
     if not alarms:
         return []
-    faults = possible_causes(monitor.twin, system.alarm_causes if system else None)
+    faults = possible_causes(monitor.twin, _alarm_causes(system, monitor.twin))
     with bar("explain") as show:
         show("alarms", 0.0)
         return find_causes(monitor.twin, record, alarms, faults)
+
+
+def _alarm_causes(system: Case | None, twin: DynamicsTwin) -> Mapping[str, Fault | None] | None:
+    """Those of the case; None where all its parameters are unknown to the twin: a black box."""
+    from retwin.twins.faults.system_faults import ParameterFault
+
+    causes = system.alarm_causes if system else None
+    used = {each.parameter for each in (causes or {}).values() if isinstance(each, ParameterFault)}
+    own = {each.name for each in twin.equations.parameters}
+    return None if used and not used & own else causes
 
 
 def _written(cause: Cause) -> str:
@@ -448,7 +460,7 @@ def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
             + (
                 "Look for the causes of the events first: a calibration with this record would "
                 "take the fault for healthy"
-                if events
+                if watched.events
                 else "If it is healthy, calibrate with this record too"
             )
         )

@@ -19,12 +19,12 @@ from retwin.twins.faults.system_faults import (
 
 SENTENCES: Mapping[type, Callable[[Any, AnyMonitor], str]] = {
     ParameterShift: lambda fault, monitor: (
-        f"The parameter {fault.parameter} of the machine has changed. Look for what sets it: "
-        "something that is open, leaks, is clogged, worn, loose or was replaced."
+        "The machine has changed. Look for something that is open, leaks, is clogged, worn, loose "
+        f"or was replaced. Details: parameter {fault.parameter} of the twin."
     ),
     ParameterDrift: lambda fault, monitor: (
-        f"The parameter {fault.parameter} of the machine moves away from its value. Look for what "
-        "wears, fouls, ages, heats up or loosens slowly, and compare it with earlier records."
+        "The machine changes slowly. Look for what wears, fouls, ages, heats up or loosens, and "
+        f"compare it with earlier records. Details: parameter {fault.parameter} of the twin."
     ),
     ActuatorGain: lambda fault, monitor: (
         f"The machine does not do what the command {_input(fault, monitor)} demands. Check the "

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from retwin.checks import finite, given, instance, require
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.detect.events import CHANGED
+from retwin.monitor.live.sentences import sentence
 from retwin.monitor.models.cause import BEFORE
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.kinds import load_monitor
@@ -22,9 +23,7 @@ from retwin.monitor.versions.decision import MIN_SAMPLES
 from retwin.monitor.versions.registry import Registry, Version
 
 
-def recalibrate(
-    store: Store, asset: str, *, hours: float = 24.0, new_normal: bool = False
-) -> Version:
+def recalibrate(store: Store, asset: str, *, hours: float = 24.0, new_normal: str = "") -> Version:
     """Calibrate the monitor of a machine anew, as a version that runs in the shadow first.
 
     The twin stays; its errors are those of the machine's newest samples outside of events, each
@@ -38,15 +37,16 @@ def recalibrate(
         Name of the machine.
     hours : float
         Newest hours from which quiet parts are taken.
-    new_normal : bool
-        Whether what has changed the machine is its new normal: then the samples since the change
-        calibrate, and none before it.
+    new_normal : str
+        The name of somebody who says that what has changed the machine is its new normal, which
+        the version keeps: then the samples since the change calibrate, and none before it.
 
     Raises
     ------
     InputError
         There is no such machine or no active version; an event lasts, or the last one was a change,
-        and it is not said to be the new normal; or too few samples are quiet.
+        and nobody says that it is the new normal: then the message states what is known of it; or
+        too few samples are quiet.
 
     """
     assets = {each.name: each for each in store.assets()}
@@ -84,18 +84,18 @@ def recalibrate(
     with tempfile.TemporaryDirectory(prefix="retwin-") as folder:
         new.save(Path(folder) / "monitor")
         reason = f"{seen / monitor.twin.rate / 3600:.3g} quiet hours of {asset}"
-        reason += ", a new normal" if new_normal else ""
+        reason += f", a new normal as {new_normal} says" if new_normal else ""
         proposed = registry.propose(Path(folder) / "monitor", reason)
     return registry.shadow(proposed.number)
 
 
-def _events(store: Store, asset: str, new_normal: bool) -> tuple[int, list[tuple[int, int]]]:
+def _events(store: Store, asset: str, new_normal: str) -> tuple[int, list[tuple[int, int]]]:
     """When the machine of now began, and when the events since then did, and ended.
 
     Raises
     ------
     InputError
-        An event lasts, or was a change, and it is not said to be the new normal.
+        An event lasts, or was a change, and nobody says that it is the new normal.
 
     """
     opened = {
@@ -110,14 +110,30 @@ def _events(store: Store, asset: str, new_normal: bool) -> tuple[int, list[tuple
     changes = [int(each["event"]) for each in ends if each["how"] == CHANGED]
     last = max((*lasting, *changes), default=None)
     require(
-        last is None or new_normal,
+        last is None or new_normal.strip(),
         "new_normal",
-        expected="a machine that is as it was, or the word that its change is the new normal",
-        got="an event that lasts" if lasting else "an event that did not end until it was a change",
-        remedy="find out whether it is a fault; if it is the new normal, say --new-normal",
+        expected="a machine that is as it was, or the name of who says that its change is normal",
+        got="an event that "
+        + ("lasts" if lasting else "did not end until it was a change")
+        + (f": {_known(store, asset, last)}" if last is not None else ""),
+        remedy="find out whether it is a fault, and repair that; if it is the new normal, say so "
+        "with your name: --new-normal NAME",
     )
     begun = last if last is not None else np.iinfo(np.int64).min
     return int(begun), [(start, end) for start, end in closed.items() if start > begun]
+
+
+def _known(store: Store, asset: str, event: int) -> str:
+    """What the log says of an event of a machine, from which somebody decides what it is."""
+    alarms, found = set[int](), list[str]()
+    for entry in store.log():
+        data = entry.data
+        if data.get("asset") == asset and data.get("event") == event:
+            alarms.add(entry.sequence)
+        elif entry.kind != "cause" or data["alarm"] not in alarms:
+            continue
+        found.append(sentence(entry))
+    return "; ".join(filter(None, found))
 
 
 def _parts(

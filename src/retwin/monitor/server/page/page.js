@@ -308,7 +308,7 @@
   // One machine.
   // An event lasts from its first alarm until the twin follows again.
   const course = (each) => each.ended ? `, until ${stamp(each.ended)} (${each.how})` : "";
-  const WORDS = { alarm: (each) => `${each.output}: ${each.change}; ${cause(each)}${course(each)}`, void: () => "the promise does not apply any more: recalibrate, or repair the machine",
+  const WORDS = { alarm: (each) => `${each.output}: ${each.change}; ${cause(each)}${course(each)}`, void: () => "the promise does not apply any more: look for a fault first",
     remark: (each) => `Remark, for which nothing is promised: ${each.output}: ${each.change}`, event: (each) => each.text };
   const asset = (name) => {
     const next = stream(name);
@@ -327,7 +327,7 @@
       const last = now.alarm;
       const texts = {
         alarm: () => [`Event since ${stamp(last.time)}${course(last)}; ${last.output}: ${last.change}.`, ...(now.void_since ? [`The promise is VOID since ${stamp(now.void_since)}.`] : []), h("a", { href: to("alarm", last.sequence) }, `Cause: ${cause(last)}`)],
-        void: () => [`The promise is VOID${now.void_since ? ` since ${stamp(now.void_since)}` : ""}: the machine is not the one of the calibration. What is seen are remarks, not alarms.`, "If the machine is healthy, recalibrate the monitor with its newest quiet hours."],
+        void: () => [`The promise is VOID${now.void_since ? ` since ${stamp(now.void_since)}` : ""}: the machine is not the one of the calibration. What is seen are remarks, not alarms.`, "Look for a fault first: a calibration would take it for healthy. Only if the machine is healthy, recalibrate."],
         stopped: () => [`No new sample has arrived for ${span(now.idle)}.`, "Check the source of the samples and its connection."],
         outside: () => ["Commands leave the range of the calibration, where the twin extrapolates.", "Calibrate on records that have such commands."],
         rate: () => ["Samples arrive at another rate than the twin's.", now.rate],
@@ -381,14 +381,15 @@
     main.replaceChildren(about, place, answer);
     let shown = "";
     let form = null;
+    let before = "";
     return async () => {
       const found = await request(`/alarms/${encodeURIComponent(sequence)}`);
       const text = JSON.stringify(found);
       if (text === shown) return;
-      if (!shown) around(place, found);
+      if (!shown) before = commandsBefore(found, await around(place, found));
       shown = text;
       const why = found.cause;
-      about.replaceChildren(h("h1", {}, found.asset, ": ", why ? fault(why.name) : "cause not known yet"),
+      about.replaceChildren(h("h1", {}, found.asset, ": ", why && why.probability >= 0.5 ? fault(why.name) : cause(found)),
         verdict("alarm", `Event since ${stamp(found.time)}${course(found)}; ${found.output}: ${found.change}. The twin of the healthy machine does not explain it.`,
           h("a", { href: to("asset", found.asset) }, "See the machine now")),
         facts(found.begin ? ["Trajectory", stamp(found.begin), `to ${clock(found.time)}`] : ["Began", why && why.onset[0] != null ? stamp(why.onset[0]) : "–", why && why.onset[1] != null && `90 % interval ${clock(why.onset[1])} to ${clock(why.onset[2])}`],
@@ -398,7 +399,7 @@
         h("h2", {}, "What to check"),
         h("div", { class: "check" }, h("p", {}, why ? why.check : "The cause is being inferred from the samples before the alarm."),
           why && why.unknown > 0.5 ? h("p", {}, `Something besides is probable (${percent(why.unknown)}): a fault that is not in the list, or one that does more than its equation.`) : null),
-        why ? probabilities(why, found.begin) : "");
+        why ? probabilities(why, found.begin) : "", choice(found, before));
       if (found.acknowledged) {
         answer.replaceChildren(h("h2", {}, "Acknowledged"), h("p", {}, "by ", found.acknowledged.who, found.acknowledged.note ? `: ${found.acknowledged.note}` : ""));
       } else if (!form) {
@@ -415,18 +416,36 @@
       fill(part, value);
       return h("tr", {}, h("th", { scope: "row" }, fault(name)), h("td", { class: "number" }, percent(value)), h("td", { "aria-hidden": "true" }, h("span", { class: "meter" }, part)));
     }))));
+  // What speaks for a fault, and what for a new normal, is stated before anybody recalibrates.
+  const choice = (found, before) => h("section", { class: "card" }, h("h2", {}, "Fault or new normal?"), h("ul", {},
+    h("li", {}, found.cause ? `Known causes: ${cause(found)} explains it best; probability of something besides them: ${percent(found.cause.unknown)}.` : "The cause is not known yet."),
+    h("li", {}, found.ended ? `It ended at ${stamp(found.ended)}: ${found.how}.` : found.begin ? "Look at the trajectories that follow." : "It lasts."),
+    before ? h("li", {}, before) : null),
+  h("p", {}, "A fault: repair it. A calibration with its samples would take it for healthy. A new normal: ", h("code", {}, `retwin monitor recalibrate STORE --asset '${found.asset}' --new-normal NAME`), ", with your name, which the version keeps."));
+  const commandsBefore = (found, held) => {
+    const rows = found.begin || !held ? [] : held.commands.filter((_, k) => held.times[k] < found.time);
+    if (!rows.length) return "";
+    const ranges = held.inputs.map((each, i) => {
+      const values = column(rows, i).filter((value) => value != null);
+      const [low, high] = [Math.min(...values), Math.max(...values)].map((value) => Number(value.toPrecision(5)));
+      return !values.length ? `${each[0]} not known` : `${unit(each)} ${low === high ? `constant at ${low}` : `${low} to ${high}`}`;
+    });
+    return `Commands in the ${span(found.time - held.times[0])} before it: ${ranges.join("; ")}.`;
+  };
   const acknowledge = (found) => {
     const who = h("input", { autocomplete: "name", maxlength: 200 });
-    const note = h("textarea", { maxlength: 2000 });
-    return h("section", { class: "card" }, h("h2", {}, "Acknowledge"), h("p", { class: "quiet" }, "It is for this alarm and for earlier ones of this machine."), h("label", {}, "Your name", who), h("label", {}, "What was found", note),
-      h("p", { class: "buttons" }, action("Acknowledge", `/alarms/${found.sequence}/acknowledge`, () => ({ who: who.value, note: note.value }), { first: true })));
+    const what = h("select", {}, ["", "a fault", "a new normal"].map((each) => h("option", { value: each }, each || "not known yet")));
+    const note = h("textarea", { maxlength: 1900 });
+    return h("section", { class: "card" }, h("h2", {}, "Acknowledge"), h("p", { class: "quiet" }, "It is for this alarm and for earlier ones of this machine."), h("label", {}, "Your name", who), h("label", {}, "What it is", what), h("label", {}, "What was found", note),
+      h("p", { class: "buttons" }, action("Acknowledge", `/alarms/${found.sequence}/acknowledge`, () => ({ who: who.value, note: [what.value, note.value].filter(Boolean).join(": ") }), { first: true })));
   };
   const around = async (place, found) => {
     const held = await request(`/alarms/${found.sequence}/samples`).catch(() => null);
-    if (!held?.times.length || !place.isConnected) return;
+    if (!held?.times.length || !place.isConnected) return null;
     const box = h("div");
     place.replaceChildren(h("h2", {}, found.begin ? "The trajectory, beside the twin of the healthy machine" : "Samples around the alarm"), box);
     pictures(box, held, () => found.begin ? [] : [found.time])(held);
+    return held;
   };
 
   // Versions of a twin.
