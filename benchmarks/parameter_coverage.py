@@ -1,14 +1,18 @@
-"""What 95 % intervals of `rt.identify` hold where the twin is right, and where it is broken.
+"""What 95 % intervals of parameters hold where the twin is right, and where it is broken.
 
 Four emulated systems, one record of 1000 samples each: a heater, a servo, a tank with a valve, a
 pendulum. Their records break the twin in turn: not at all (white noise); by coloured noise
 (autoregressive, 0.95, three times as large); by a term that the twin lacks (radiation, dry friction
 of the servo and of the pendulum, an outflow that grows with the level); by a sensor that clips a
-third of the range. The truth of a broken twin is the estimate from 100 records together. 300
-records are identified for each; targets: intervals hold 0.90 to 0.98, and where the twin is right
-they are hardly wider than those of independent errors.
+third of the range. The truth of a broken twin is the estimate of `rt.identify` from 100 records
+together. 300 records are identified for each; targets: intervals hold 0.90 to 0.98, and where the
+twin is right they are hardly wider than those of independent errors.
 
-    python benchmarks/parameter_coverage.py [RECORDS]
+With `dynamics`, the intervals are those of `fit_dynamics` with terms up to second degree. The terms
+depend on the range of a record, and parameters on the terms: the truth of a broken twin is the
+estimate of the same equations from 30 other records.
+
+    python benchmarks/parameter_coverage.py [RECORDS] [identify | dynamics]
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from itertools import product
 
@@ -28,6 +33,10 @@ from scipy.signal import lfilter
 import retwin as rt
 from retwin.evaluation.identification.parameters import uncertainty_of
 from retwin.twins import State, StateTwin
+from retwin.update.dynamics import Dynamics, FittedDynamics, Library, fit_dynamics
+from retwin.update.dynamics.estimation import Estimation, correlation_time
+from retwin.update.dynamics.linearised import Point
+from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 from retwin.update.identification import LeastSquares
 from retwin.workers.pools import worker_pool
 
@@ -125,6 +134,47 @@ def estimated(name: str, made: rt.Trajectories) -> tuple[NDArray, NDArray, NDArr
     return np.array([found.values[each] for each in true]), np.diff(ends)[:, 0] / 2, white
 
 
+def corrected(
+    name: str, kind: str, made: rt.Trajectories, others: rt.Trajectories
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Estimates beside a discrepancy, half widths of intervals, and the truth of its equations."""
+    twin, true, *_ = SYSTEMS[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = fit_dynamics(
+            twin.holding(LACKING), made, Dynamics(Library(2, (), False), memory=False)
+        )
+    ends = np.array(list(found.intervals.values()))
+    limit = np.array(list(true.values()))
+    if kind not in ("right", "coloured noise"):
+        limit = limit_of(found, twin.holding(LACKING), others)
+    return np.array(list(found.parameters.values())), np.diff(ends)[:, 0] / 2, limit
+
+
+def limit_of(found: FittedDynamics, before: rt.ParametricTwin, many: rt.Trajectories) -> NDArray:
+    """The parameters of the same corrected equations from many records."""
+    base, free, values = state_twin_of(before)
+    own, equations = len(base.parameters), found.twin.equations
+    more = equations.parameters[own:]
+    unknowns = unknowns_of(base, free, values).with_coefficients(more)
+    shared = [*found.parameters.values(), *found.twin.values[own : own + len(more)]]
+    begun = Estimation(equations, many, unknowns, many.mask, np.ones(1))
+    at = begun.linearised(Point(np.array(shared), np.zeros((len(many), 0))))
+    variance = correlation_time(at.residual) * begun.power(at.residual)
+    return replace(begun, variance=variance).minimised(at).point.shared[: len(free)]
+
+
+def study_dynamics(name: str, kind: str, count: int) -> dict[str, float]:
+    """Shares of intervals of `fit_dynamics` that hold, by parameter, and their median widths."""
+    others, true = records(name, kind, 30, 10_000), SYSTEMS[name][1]
+    found = [corrected(name, kind, records(name, kind, 1, seed), others) for seed in range(count)]
+    values, half, limit = (np.array(each) for each in zip(*found, strict=True))
+    inside, widths = np.mean(np.abs(values - limit) <= half, axis=0), np.median(half, axis=0)
+    return dict(zip([f"{key} holds" for key in true], inside.tolist(), strict=True)) | {
+        "half width, of the value": float(np.max(widths / list(true.values())))
+    }
+
+
 def study(name: str, kind: str, count: int) -> dict[str, float]:
     """Shares of intervals that hold, by parameter, and the median of their relative widths."""
     true = np.array(list(SYSTEMS[name][1].values()))
@@ -145,9 +195,10 @@ def study(name: str, kind: str, count: int) -> dict[str, float]:
 
 def main() -> None:
     count = int(sys.argv[1]) if len(sys.argv) > 1 else RECORDS
-    pairs = list(product(SYSTEMS, KINDS))
+    dynamics = "dynamics" in sys.argv
+    run, pairs = study_dynamics if dynamics else study, list(product(SYSTEMS, KINDS))
     with worker_pool(2) as pool:
-        jobs = [pool.schedule(study, (*pair, count)) for pair in pairs]
+        jobs = [pool.schedule(run, (*pair, count)) for pair in pairs]
         found = {pair: job.result() for pair, job in zip(pairs, jobs, strict=True)}
     rows = {
         f"{name}, {kind}": {
@@ -165,7 +216,8 @@ def main() -> None:
             if own == kind and key.endswith("holds")
         ]
         rows[f"all, {kind}"] = {"lowest share": min(shares), "mean share": float(np.mean(shares))}
-    record("parameter_coverage", f"95 % intervals of {count} records each", rows)
+    key = "dynamics_coverage" if dynamics else "parameter_coverage"
+    record(key, f"95 % intervals of {count} records each", rows)
 
 
 if __name__ == "__main__":  # worker processes are spawned

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from retwin.cases.case import Case
 from retwin.checks import nothing, require
 from retwin.data.io import load
-from retwin.data.quality.copies import find_copies
+from retwin.data.quality.copies import distinct_records, find_copies
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Report
@@ -181,8 +181,7 @@ def _measured(trajectories: Trajectories) -> NDArray:
 
 def _first(trajectories: Trajectories) -> NDArray:
     """Indices of the trajectories that are no copies of earlier ones."""
-    copies = [i for i, _, _ in find_copies(_measured(trajectories))]
-    return np.setdiff1d(np.arange(len(trajectories)), copies)
+    return distinct_records(_measured(trajectories))
 
 
 def _labelled(trajectories: Trajectories, case: Case, name: str) -> Trajectories:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ from scipy.optimize import minimize
 
 import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
+from retwin.update.dynamics import Dynamics, Library, fit_dynamics
 from retwin.update.dynamics import estimation as module
 from retwin.update.dynamics.arrow import Arrow, trust_region_step
 from retwin.update.dynamics.estimation import Estimation
-from retwin.update.dynamics.left_out import errors_without, held_out
+from retwin.update.dynamics.left_out import dependent_errors, errors_without, held_out
 from retwin.update.dynamics.linearised import Linearised, Point
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 
@@ -151,6 +153,35 @@ def test_parts_that_overlap_are_left_out_one_by_one() -> None:
     parts = [seen & (np.arange(25) < 15), seen & (np.arange(25) > 10), ~seen]
     for part, errors in zip(parts, errors_without(own, start, parts), strict=True):
         np.testing.assert_array_equal(errors, held_out(own, start, [part]).errors)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1])
+def test_standard_errors_come_from_what_varies_between_records(offset: float) -> None:
+    """Each record has an error of its own beside white noise, which the twin does not know."""
+    own, start = estimation(20, 25)
+    apart = offset * np.random.default_rng(1).normal(size=(20, 1, 2))
+    record = own.observed.replace(observed=own.observed.observed + apart)
+    own = replace(own, observed=record)
+    found = own.minimised(own.linearised(start.point))
+    errors, factor = dependent_errors(own, found, 2)
+    expected = np.sqrt(np.diag(own.covariance(found))[:2])
+    if offset:
+        assert (errors > 3 * expected).all()
+    else:
+        np.testing.assert_allclose(errors, expected, rtol=0.25)
+    assert (np.abs(found.point.shared - (9.0, 0.8)) < factor * errors).all()
+
+
+def test_copies_of_records_count_once() -> None:
+    record, rows = estimation(6, 100)[0].observed, [0, 1, 2, 3, 1, 3]
+    arrays = {name: getattr(record, name)[rows] for name in ("commands", "observed", "mask")}
+    settings = Dynamics(Library(1, (), False), memory=False)
+    once = fit_dynamics(OSCILLATOR, record[:4], settings)
+    with pytest.warns(UserWarning, match="2 of 6 trajectories are copies"):
+        found = fit_dynamics(OSCILLATOR, record.replace(**arrays), settings)
+    assert found.parameters == once.parameters
+    assert found.errors == once.errors
+    assert found.intervals == once.intervals
 
 
 def test_memory_is_proportional_to_the_number_of_trajectories() -> None:

@@ -1,4 +1,4 @@
-"""`find_copies`: records that were recorded once."""
+"""`find_copies` and `distinct_records`: records that were recorded once."""
 
 from __future__ import annotations
 
@@ -56,6 +56,11 @@ def find_copies(measured: NDArray) -> list[tuple[int, int, str]]:
                 found.append((i, j, why))
                 break
     return found
+
+
+def distinct_records(measured: NDArray) -> NDArray:
+    """Indices of the records (n, T, d_y) that are no copies of earlier ones, see `find_copies`."""
+    return np.setdiff1d(np.arange(len(measured)), [i for i, _, _ in find_copies(measured)])
 
 
 def _difference(one: NDArray, other: NDArray) -> str | None:

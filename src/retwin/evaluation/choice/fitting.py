@@ -16,7 +16,7 @@ from retwin.catalog import CANDIDATES
 from retwin.checks import require
 from retwin.data.measured import check_magnitude
 from retwin.data.quality.check import Checked
-from retwin.data.quality.copies import find_copies
+from retwin.data.quality.copies import distinct_records
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.choice.candidates import Candidates, Model
 from retwin.evaluation.choice.comparison import Comparison
@@ -228,8 +228,7 @@ def _select_records(records: Trajectories, settings: Choice) -> Trajectories:
     else:
         own = records[calibrating(records, settings.calibrate_on)]
     # A part that is left out must not be seen in a copy of it.
-    copies = [i for i, _, _ in find_copies(np.where(own.mask, own.observed, np.nan))]
-    return own[np.setdiff1d(np.arange(len(own)), copies)]
+    return own[distinct_records(np.where(own.mask, own.observed, np.nan))]
 
 
 def _names(candidates: Candidates, settings: Choice) -> list[str]:

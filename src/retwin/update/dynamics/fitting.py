@@ -15,6 +15,7 @@ from scipy.linalg import block_diag
 from retwin.checks import require
 from retwin.data.measured import unmeasured
 from retwin.data.quality.check import doubtful
+from retwin.data.quality.copies import distinct_records
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.equations.state_twin import StateTwin
@@ -24,6 +25,7 @@ from retwin.update.dynamics.between_samples import chosen
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import Estimation, root
+from retwin.update.dynamics.left_out import dependent_errors
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
 from retwin.update.dynamics.memory import Memory
@@ -36,6 +38,8 @@ from retwin.workers.threads import one_thread
 
 __all__ = ["FittedDynamics", "assembled", "fit_dynamics"]
 
+NORMAL_95 = 1.96
+"""Standard errors from an estimate to an end of its 95 % interval."""
 NONLINEAR = 1.5
 """Ratio of the errors of a simulation to those of a linear step, from which on the step is none."""
 
@@ -50,9 +54,12 @@ class FittedDynamics:
         The corrected twin.
     parameters, errors : dict of str to float
         The twin's own parameters theta, and their standard errors, which allow for errors of the
-        outputs that are correlated within the parts that are held out; infinite for those that
-        the record does not determine. They hold for the chosen form of the discrepancy, in which a
-        parameter takes what it explains: its value is then that of the equations beside the terms.
+        outputs that are correlated within records, blocks of time, and the parts that are held out;
+        infinite for those that the record does not determine. They hold for the chosen form of the
+        discrepancy, in which a parameter takes what it explains: its value is then that of the
+        equations beside the terms.
+    intervals : dict of str to tuple of float
+        Their 95 % intervals, by Student's t distribution where few blocks give the errors.
     correlations : dict of (str, str) to float
         Posterior correlations of the parameters, with each other and with the coefficients of the
         terms; the strongest first. Those of parameters that are not determined are left out.
@@ -71,13 +78,15 @@ class FittedDynamics:
         Duration.
     reason : str
         What the result does not cover: parameters and starts that are at bounds, parameters
-        that the record does not determine, and measurements that are doubtful.
+        that the record does not determine, measurements that are doubtful, and trajectories that
+        are copies of others, which count once.
 
     """
 
     twin: DynamicsTwin
     parameters: dict[str, float]
     errors: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
     correlations: dict[tuple[str, str], float]
     terms: dict[str, float]
     figures: dict[str, float]
@@ -138,13 +147,17 @@ def fit_dynamics(
     -----
     UserWarning
         A parameter, or the start of a state, is at its bound, the record does not determine a
-        parameter, or an output never changes or holds a value that seems to stand for a missing
-        measurement.
+        parameter, trajectories are copies, or an output never changes or holds a value that seems
+        to stand for a missing measurement.
 
     """
     began = time.perf_counter()
     base, free, values = state_twin_of(twin)
     checked_stride(base, observed, None, "observed")
+    once = distinct_records(np.where(observed.mask, observed.observed, np.nan))
+    copies = len(observed) - len(once)
+    again = f"{copies} of {len(observed)} trajectories are copies and count once" * bool(copies)
+    observed = observed[once]
     report = progress or (lambda share: None)
     unknowns = unknowns_of(base, free, values)
     if settings.held:
@@ -163,18 +176,24 @@ def fit_dynamics(
     unknown = estimation.undetermined(found)[: unknowns.count]
     if alone.absorbed is not None:
         unknown |= (alone.absorbed(fitted.point.shared)[1] != 0).any(axis=0)
-    own = [_notes(estimation, found.point, unknown), unmeasured(observed), doubtful(observed)]
-    notes = "; ".join(filter(None, own))
+    own = _notes(estimation, found.point, unknown)
+    notes = "; ".join(filter(None, [own, unmeasured(observed), doubtful(observed), again]))
     if notes:
         warnings.warn(notes, stacklevel=2)
     k, count = unknowns.count, len(found.point.shared)
     covariance = estimation.covariance(found)[:count, :count]
     deviation = np.sqrt(np.maximum(np.diag(covariance), held_out.variance))
-    deviation[: len(unknown)][unknown] = np.inf
+    apart, factor = dependent_errors(estimation, found, k)
+    half = np.maximum(NORMAL_95 * deviation[:k], factor * apart)
+    error = np.maximum(deviation[:k], apart)
+    half[unknown] = error[unknown] = np.inf
+    theta = found.point.shared[:k]
+    ends = zip((theta - half).tolist(), (theta + half).tolist(), strict=True)
     return FittedDynamics(
         twin=made,
-        parameters=dict(zip(unknowns.names, found.point.shared[:k].tolist(), strict=True)),
-        errors=dict(zip(unknowns.names, deviation[:k].tolist(), strict=True)),
+        parameters=dict(zip(unknowns.names, theta.tolist(), strict=True)),
+        errors=dict(zip(unknowns.names, error.tolist(), strict=True)),
+        intervals=dict(zip(unknowns.names, ends, strict=True)),
         correlations=_correlations(estimation.unknowns.names, covariance, unknown),
         terms=_sizes(equations, memory, estimation, found.point),
         figures={

@@ -6,9 +6,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from retwin.update.dynamics.estimation import RESOLUTION, Estimation
 from retwin.update.dynamics.linearised import HeldOut, Linearised
+from retwin.update.score_covariance import score_covariance
 
 
 def held_out(estimation: Estimation, at: Linearised, folds: Sequence[NDArray]) -> HeldOut:
@@ -49,6 +51,41 @@ def errors_without(
     for i, rows, error, jacobian in _parts(estimation, at, parts, by_unit):
         made[i][rows][parts[i][rows]] = error - jacobian @ steps[i]
     return [np.where(estimation.seen, each, 0.0) for each in made]
+
+
+def dependent_errors(estimation: Estimation, at: Linearised, count: int) -> tuple[NDArray, NDArray]:
+    """Standard errors (count,) of the first shared coordinates, and factors to 95 % intervals.
+
+    They are those of `score_covariance`, from what varies between blocks of time and records: the
+    residuals are weighted by how far each moves the estimates, in one Gauss-Newton step.
+
+    Parameters
+    ----------
+    estimation : Estimation
+        The unknowns and the outputs.
+    at : Linearised
+        The optimum.
+    count : int
+        The number of coordinates.
+
+    """
+    if not count:
+        return np.zeros(0), np.zeros(0)
+    unknowns, k = estimation.unknowns, estimation.unknowns.count
+    curvature = estimation.bounded_curvature(at)
+    unit, scale = curvature.unit, 1 / np.sqrt(estimation.variance)
+    complement, follow, _ = curvature.scaled(unit).reduced()
+    back = np.linalg.pinv(complement, RESOLUTION * k, hermitian=True)[:, :count] * unit[:count]
+    own = unit[k:].reshape(follow.shape[:2])[..., None] * follow @ back
+    by_parameters, starts = unknowns.matrix @ (unit[:k, None] * back), unknowns.free
+    score = np.empty((*at.residual.shape, count))
+    for rows, _, slope in estimation.derivatives(at.point):
+        known, of_start = slope[..., : len(by_parameters)], len(by_parameters) + starts
+        moved = np.einsum("ntdm,nmk->ntdk", slope[..., of_start], own[rows])
+        score[rows] = (known @ by_parameters - moved) * scale[:, None]
+    measured = int(estimation.seen.sum())
+    covariance, freedom = score_covariance(score, at.residual * scale, measured)
+    return np.sqrt(np.diag(covariance)), student.ppf(0.975, freedom)
 
 
 def _left_out(

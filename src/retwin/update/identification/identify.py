@@ -16,7 +16,7 @@ from scipy import stats
 
 from retwin.checks import given, require
 from retwin.data.measured import measured_only, unmeasured
-from retwin.data.quality.copies import find_copies
+from retwin.data.quality.copies import distinct_records
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
@@ -299,8 +299,7 @@ def _fit(
     optima = search.run(np.random.default_rng(misfit.seed))
     best, point = optima[0]
     residual = misfit.residuals(np.array([best.values]))[0]
-    copies = find_copies(np.where(misfit.seen, misfit.measured, np.nan))
-    once = np.setdiff1d(np.arange(len(residual)), [i for i, _, _ in copies])
+    once = distinct_records(np.where(misfit.seen, misfit.measured, np.nan))
     found, errors, agreeing = _identifiability(search, optima, point, residual, once)
     # Starts draw all parameters; one without effect has no other value than the present one.
     kept = np.where(found.effects > 0, best.values, twin.values)
@@ -335,7 +334,7 @@ def _fit(
             "rms_after": misfit.rms_of(residual),
             "measurements": float(misfit.seen.sum()),
             "independent": found.independent,
-            "copies": float(len(copies)),
+            "copies": float(len(residual) - len(once)),
             "starts_agreeing": float(agreeing),
         },
         reason="; ".join(filter(None, [best.reason, found.warning, missing, unknown])),

@@ -11,10 +11,10 @@ from scipy import stats
 from retwin.checks import one_of, whole
 from retwin.data.measured import measured_only
 from retwin.data.trajectories import Trajectories
-from retwin.update.identification.identifiability import variance_of
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.misfit import misfit_of
 from retwin.update.identification.search import LeastSquares, Search
+from retwin.update.score_covariance import variance_of
 
 MARGIN = 2.0
 """Distance of the outermost values from the optimum, in halves of the 95 % interval."""
