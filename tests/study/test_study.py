@@ -170,7 +170,7 @@ def test_calibration_and_test_sets_keep_their_roles(
     calibration, test = emulated.split(0.4, seed=0)
     for name, part in (("c", calibration), ("t", test), ("twin", twin_set)):
         rt.save(part, tmp_path / f"{name}.npz")
-    plan = rt.StudyPlan(sources=("dt", "ibg_rg"), runs=1, per_class=8)
+    plan = rt.StudyPlan(sources=("dt", "ibg_rg"), runs=1, per_class=8, ablations=False)
     data = rt.StudyData(tmp_path / "twin.npz", tmp_path / "c.npz", tmp_path / "t.npz")
     results = rt.run_study(case, plan, data, tmp_path / "out", processes=2)
     assert results.data.test.ids == test.ids.tolist()
@@ -178,6 +178,8 @@ def test_calibration_and_test_sets_keep_their_roles(
     assert results.data.calibration.n == len(calibration)
     assert results.data.calibration.used == healthy.ids.tolist()
     assert results.data.twin.n == 108
+    fidelity = results.fidelity["ibg_rg"]
+    assert (fidelity.rivals, fidelity.widening) == ([], None), "without ablations"
     row = next(r for r in results.comparisons if r.metric == "macro_f1")
     assert row.p is None, "one run has no Welch test"
 

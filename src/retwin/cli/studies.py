@@ -25,8 +25,8 @@ COLUMNS = {name: metric.head for name, metric in catalog.METRICS.items() if metr
 """Scores that are shown, and the heads of their columns."""
 DEMO = ("dt", "ibg_rg_command", "inversion")
 """What the demo compares: the original twin, and what is best here."""
-DEMO_PER_CLASS = 200
-"""Generated trajectories per class in the demo, half of a study's, which keeps it short."""
+DEMO_PER_CLASS = 100
+"""Generated trajectories per class in the demo, a quarter of a study's, which keeps it short."""
 DEMO_HEALTHY = 125
 """Emulated healthy trajectories in the demo: a promise at 5 % false alarms can then be decided."""
 DEMO_OVERLAID = 10
@@ -169,6 +169,7 @@ def demo(
         per_class=DEMO_PER_CLASS,
         emulated_healthy=DEMO_HEALTHY,
         overlaid=DEMO_OVERLAID,
+        ablations=False,
     )
     titles = ", ".join(catalog.SOURCES[name].title for name in DEMO)
     kind = "real" if folder else "emulated"

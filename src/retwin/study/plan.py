@@ -83,6 +83,9 @@ class StudyPlan:
     overlaid : int, optional
         Test trajectories per class and fold that are simulated for the fidelity and for the
         predictive overlay, at least 1; by default all. Diagnoses are of all in any case.
+    ablations : bool
+        Whether the fidelity of a residual model is compared with that of simpler ones, and whether
+        its bands are widened by held-out trajectories: two further fits in each fold.
 
     Raises
     ------
@@ -104,6 +107,7 @@ class StudyPlan:
     learning_curve: bool = False
     emulated_healthy: int = 10
     overlaid: int | None = None
+    ablations: bool = True
 
     def __post_init__(self) -> None:
         one_of("preset", self.preset, PRESETS)

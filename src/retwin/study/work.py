@@ -314,7 +314,7 @@ class Work:
         rivals: dict[str, Twin] = {}
         widening = None
         corrected = any(kind == "residual" for kind, _ in SOURCES[trial.job.name].needs)
-        if corrected and isinstance(twin, CorrectedTwin) and twin.random:
+        if self.plan.ablations and corrected and isinstance(twin, CorrectedTwin) and twin.random:
             rivals, widening = self._rivals(trial, twin), self._widening(trial)
         found = measure_fidelity(
             twin,

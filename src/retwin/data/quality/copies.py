@@ -91,6 +91,8 @@ def _repeats(a: NDArray, b: NDArray) -> bool | None:
     if np.sqrt(np.mean(apart**2)) <= NEAR * noise and len(a) > COMPARED:
         return True
     moves = np.diff(a) != 0
+    if apart.max() > 1.5 * np.abs(np.diff(a)[moves]).min():
+        return None  # more than the step of any quantisation
     step = np.diff(np.unique(np.concatenate([a, b]))).min()
     quantised = len(np.unique(a)) < len(a) / 2 and moves.sum() >= COMPARED
     alike = apart.max() <= 1.5 * step and (apart[1:][moves] < step / 2).mean() >= SAME

@@ -59,7 +59,9 @@ def _excursions(place: int, each: Readings) -> NDArray:
     ]
     long = np.diff(each.stretches)[:, 0] <= LONG * len(y)
     inside = (each.stretches[:, 0] > 0) & (each.stretches[:, 1] < len(y))
-    start, end = np.unique(np.concatenate([*pairs, each.stretches[long & inside]]), axis=0).T
+    both = np.concatenate([*pairs, each.stretches[long & inside]])
+    # As one number each, of which equal ones are found in a tenth of the time.
+    start, end = np.divmod(np.unique(both @ [len(y) + 1, 1]), len(y) + 1)
     out, back = step[start - 1], step[end - 1]
     size = np.minimum(np.abs(out), np.abs(back))
     kept = (out * back < 0) & (np.abs(y[end] - y[start - 1]) <= ALIKE * size)

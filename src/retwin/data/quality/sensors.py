@@ -48,10 +48,10 @@ def find_constant(every: Sequence[Readings]) -> Iterator[Finding]:
 def find_stretches(every: Sequence[Readings]) -> Iterator[Finding]:
     """Values that last while everything that drives the output moves: frozen, or a limit."""
     longest = np.array([each.still.max(initial=0) for each in every])
+    noisy = _noisy(every)
     for place, each in enumerate(every):
         others = np.delete(longest, place)
         usual = float(np.quantile(others, 0.25)) if len(others) else 0.0
-        noisy = _noisy(each, [other for other in every if other is not each])
         for level in _unusual(each, usual, noisy=noisy):
             start, end, count = each.span_of(level)
             yield each.finding(*_named(each, level, start, end, count), start, end)
@@ -87,18 +87,18 @@ def _unusual(each: Readings, usual: float, *, noisy: bool) -> list[float]:
     return values[found].tolist()
 
 
-def _noisy(each: Readings, others: Sequence[Readings]) -> bool:
+def _noisy(every: Sequence[Readings]) -> bool:
     """Whether an output shows noise wherever it is not still, so that stillness is no rest.
 
     The value that lasts longest in a record does not count: it is what is asked about.
     """
     expected, found = 0, []
-    for own in (each, *others):
+    for own in every:
         longest = int(own.levels[1].max(initial=0)) // WINDOW
         expected += len(own.noise) - min(longest, int((own.noise == 0).sum()))
         found.append(own.noise[own.noise > 0])
     noise = np.concatenate(found)
-    values = np.unique(np.concatenate([own.values for own in (each, *others)]))
+    values = np.unique(np.concatenate([own.values for own in every]))
     if len(noise) < max(1, NOISY * expected) or len(values) < 2:
         return False
     resolution = max(np.diff(values).min(), 4 * np.spacing(np.float32(np.abs(values).max())))
