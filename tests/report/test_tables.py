@@ -7,10 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from retwin.data.quality.finding import Finding
 from retwin.report.blocks import Cell, Column, Table
 from retwin.report.glossary import explained
 from retwin.report.labels import distinct, learned_name, percent, percents
 from retwin.report.page import DOCS
+from retwin.report.records import finding_rows
 
 
 def test_columns_and_rows_of_dashes_are_not_drawn() -> None:
@@ -69,3 +71,15 @@ def test_every_section_links_to_a_heading_of_the_documentation(
     linked = re.findall(rf'href="{re.escape(DOCS)}#([^"]*)"', rendered(write(study)))
     assert len(linked) > 10
     assert set(linked) <= anchors
+
+
+def test_many_findings_of_a_kind_are_a_row() -> None:
+    def found(record: int, channel: str) -> Finding:
+        return Finding(f"r{record}", channel, "frozen", f"stays at {record}", 1.0, 2.0, "remark")
+
+    many, few = [found(i, "x") for i in range(5)], [found(i, "y") for i in range(2)]
+    rows = finding_rows([*many, *few])
+    assert rows[0] == ("r0, r1, r2, r3, r4", "x", "", "frozen: for instance stays at 0")
+    assert rows[1:] == [each.row for each in few]
+    every = [found(i, f"c{i}") for i in range(43)]
+    assert finding_rows(every)[40:] == [("and 3 more", "", "", "")]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.quality.check import Checked
-from retwin.data.quality.finding import Finding
+from retwin.data.quality.finding import NAMED, Finding
 from retwin.data.trajectories import Trajectories
 from retwin.report.blocks import Table, tabulate, text_column
 from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, Spans
@@ -17,7 +17,7 @@ from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, Span
 TITLE = "What your records look like"
 """The heading on the terminal and on pages."""
 ROWS, PICTURES = 40, 12
-"""Findings and pictures that are shown, at most."""
+"""Rows and pictures that are shown, at most."""
 CLEAN = "Nothing was found that speaks against the records."
 """What is said where there is no finding."""
 HEADS = ("record", "channel", "time", "finding")
@@ -41,10 +41,22 @@ def records_part(checked: Checked) -> RecordsPart:
 
 
 def finding_rows(findings: Sequence[Finding]) -> list[tuple[str, str, str, str]]:
-    """Record, channel, time and text of findings, and how many more there are."""
-    rows = [each.row for each in findings[:ROWS]]
-    more = len(findings) - ROWS
-    return [*rows, (f"and {more} more", "", "", "")] if more > 0 else rows
+    """Record, channel, time and text of findings, and how many more there are.
+
+    Many of one kind in one channel are a row, with the figures of the first.
+    """
+    alike: dict[tuple[str, str], list[Finding]] = {}
+    for each in findings:
+        alike.setdefault((each.kind, each.channel), []).append(each)
+    rows = []
+    for own in alike.values():
+        if len(own) <= NAMED:
+            rows += [each.row for each in own]
+        else:
+            names = ", ".join(dict.fromkeys(each.row[0] for each in own))
+            rows.append((names, own[0].channel, "", f"{own[0].kind}: for instance {own[0].text}"))
+    more = len(rows) - ROWS
+    return [*rows[:ROWS], (f"and {more} more", "", "", "")] if more > 0 else rows
 
 
 def records_figure(checked: Checked) -> Figure | None:
