@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.cases import ColumnRecords, Record, TimeColumn
+from retwin.cases import ColumnRecords, Record, TimeColumn, read_logs
 
 U, Y = rt.Channels(("u",), ("V",)), rt.Channels(("y",), ("V",))
 COLUMNS = {"u": "in", "y": ("a", "b")}
@@ -170,6 +170,26 @@ def test_records_of_a_folder(tmp_path: Path) -> None:
     ]:
         with pytest.raises(rt.InputError, match=message):
             refused()
+
+
+def test_one_file_of_a_folder_is_read_by_its_columns(tmp_path: Path) -> None:
+    """All its rows, as a user's own file of the same columns is."""
+    for name, own in (("day-0", 0), ("last", 5), ("mine", 9)):
+        write(tmp_path / f"{name}.csv", [0, 0.1, 0.2, 0.3], [own] * 4, [own] * 4, [own + 2] * 4)
+    first = Record(COLUMNS, files="day-*.csv", time="time", rows=(0, 3), transient=0.1)
+    records = ColumnRecords(TWIN, first, Record(COLUMNS | {"y": "b"}, files="last.csv"))
+    for name, command, output in (("day-0", 0, 1), ("last", 5, 7), ("mine", 9, 10)):
+        alone = records.of_file(tmp_path / f"{name}.csv")
+        assert alone.ids.tolist() == [name]
+        assert alone.commands[0, :, 0].tolist() == [command] * 4
+        assert alone.observed[0, alone.mask[0, :, 0], 0].tolist() == [output] * 4
+    case = rt.cases.get("incubator")
+    rows = [f"{each / case.twin.rate},1,20,{30 + each},{32 + each}" for each in range(60)]
+    (tmp_path / "own.csv").write_text("\n".join(["time,heater_on,t1,t2,t3", *rows]))
+    read = read_logs([tmp_path / "own.csv"], case.twin, case=case)
+    assert read.trajectories.ids.tolist() == ["own"]
+    np.testing.assert_allclose(read.trajectories.observed[0, :3, 0], [31, 32, 33], atol=1e-6)
+    assert read.test is None
 
 
 def test_a_case_file_has_the_same_keys(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatch
 from glob import glob
 from itertools import chain
 from math import inf
@@ -232,6 +233,17 @@ class ColumnRecords:
             return Trajectories.concatenate([each.padded(steps) for each in records])
 
         return made("calibration", calibration), made("test", test)
+
+    def of_file(self, path: Path) -> Trajectories:
+        """All rows of one file of such a folder, as a trajectory with the name of the file.
+
+        Its columns are those of the record that names the file, else of the first record.
+        """
+        every = self.every_record
+        named = (each for each in every if any(fnmatch(path.name, n) for n in _several(each.files)))
+        record = replace(next(named, every[0]), rows=None, transient=0.0, files=str(path))
+        source = Provenance(path.name, sha256(path))
+        return record_in(_table(path, [record]), record, self.twin, path.stem, source)
 
 
 def record_in(

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from retwin.cases.case import Case
+from retwin.cases.columns import ColumnRecords
 from retwin.cases.matching import matched
 from retwin.cases.measured import usable
 from retwin.cases.named_signals import (
@@ -260,6 +261,8 @@ class LogReader:
         mapping, names = self.columns.mapping, self.columns.names
         records = None if case is None or names or mapping is not None else case.records
         if records is not None and (_is_table(path) or path.is_dir()):
+            if isinstance(records, ColumnRecords) and records.in_folder and path.is_file():
+                return records.of_file(path), []
             calibration, test = records(path)
             return calibration, [test]
         if mapping is not None:
