@@ -186,7 +186,7 @@ def test_the_tutorial(folder: Path) -> None:
         words = shlex.split(line + " " + SMALL * line.startswith("study"))
         result = CliRunner().invoke(app, words, catch_exceptions=False)
         assert result.exit_code == 0, f"retwin {line}: {result.output}"
-    assert (folder / "study" / "report.html").stat().st_size > 1e6
+    assert (folder / "study" / "report.html").stat().st_size > 5e5  # the plot library alone
 
 
 def test_every_picture_has_its_script() -> None:
