@@ -15,32 +15,15 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from leaking_tank import TANK, recorded
 
-import retwin as rt
 from retwin.monitor import Live, Registry, Samples, Store, export_log, fit_monitor, verify
-from retwin.twins import Parameter, ParameterShift, State, StateTwin
+from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics
 
 ASSETS = ("pump", "tank", "valve")
 BEGIN = 1_700_000_000 * 10**9
 STEPS = 2000
-TANK = StateTwin(
-    (State("level", "m", 0.5, 0.0, 3.0),),
-    lambda x, u: x.level,
-    rt.Channels(("pump",), ("V",)),
-    rt.Channels(("level",), ("m",)),
-    1.0,
-    derivative=lambda x, u, p: (0.1 * u.pump - p.drain * x.level,),
-    parameters=(Parameter("drain", "1/s", 0.01, 1.0, 0.1),),
-)
-
-
-def recorded(seed: int, steps: int, fault: rt.Fault | None = None) -> rt.Trajectories:
-    """A record of an emulated machine."""
-    rng = np.random.default_rng(seed)
-    pump = np.repeat(rng.uniform(0.0, 2.0, size=(1, steps // 20, 1)), 20, axis=1)
-    made = TANK.simulate(pump, faults=[fault], seed=0, parameters={"drain": 0.13})
-    return made.replace(observed=made.observed + 0.01 * rng.normal(size=made.observed.shape))
 
 
 @cache
@@ -49,7 +32,7 @@ def streams() -> dict[str, np.ndarray]:
     made = {}
     for i, name in enumerate(ASSETS):
         leak = ParameterShift("drain", size=0.2, onset=500.0 + 100 * i, end=900.0)
-        record = recorded(100 * i, STEPS, leak if i < 2 else None)
+        record = recorded(100 * i, leak if i < 2 else None, steps=STEPS)
         made[name] = np.concatenate([record.commands[0], record.observed[0]], axis=1).astype(float)
     return made
 
@@ -137,8 +120,8 @@ def differences(folder: Path, url: str, steps: int) -> list[str]:
 def main(folder: Path, url: str, kills: int, seed: int) -> None:
     """Kill the process at random moments, let it finish, and compare with one that was not."""
     rng = np.random.default_rng(seed)
-    twin = fit_dynamics(TANK, recorded(9001, 1000), Dynamics(Library(0, (), False))).twin
-    fit_monitor(twin, recorded(9002, 1000), "1 per day").save(folder / "watch")
+    twin = fit_dynamics(TANK, recorded(9001, steps=1000), Dynamics(Library(0, (), False))).twin
+    fit_monitor(twin, recorded(9002, steps=1000), "1 per day").save(folder / "watch")
     prepared(folder / "killed", url)
     streams()
     done = 0

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from leaking_tank import TANK, recorded
 
 import retwin as rt
 from retwin.errors import InputError
@@ -35,28 +36,12 @@ from retwin.monitor.program import _offer
 from retwin.monitor.settings import TwinSettings
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.updates import Asset, Update
-from retwin.twins import Parameter, ParameterShift, State, StateTwin
+from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
 STEPS = 400
-TANK = StateTwin(
-    (State("level", "m", 0.5, 0.0, 3.0),),
-    lambda x, u: x.level,
-    rt.Channels(("pump",), ("V",)),
-    rt.Channels(("level",), ("m",)),
-    1.0,
-    derivative=lambda x, u, p: (0.1 * u.pump - p.drain * x.level,),
-    parameters=(Parameter("drain", "1/s", 0.01, 1.0, 0.1),),
-)
-
-
-def recorded(seed: int, fault: rt.Fault | None = None, count: int = 1) -> rt.Trajectories:
-    rng = np.random.default_rng(seed)
-    pump = np.repeat(rng.uniform(0.0, 2.0, size=(count, STEPS // 20, 1)), 20, axis=1)
-    made = TANK.simulate(pump, faults=[fault] * count, seed=0, parameters={"drain": 0.13})
-    return made.replace(observed=made.observed + 0.01 * rng.normal(size=made.observed.shape))
 
 
 def rows(record: rt.Trajectories, i: int = 0) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from leaking_tank import TANK, recorded
 
 import retwin as rt
 from retwin.errors import InputError
@@ -37,25 +38,8 @@ from retwin.monitor.versions import comparison
 from retwin.monitor.versions.decision import MIN_SAMPLES, decide
 from retwin.monitor.versions.recalibration import _events, _parts
 from retwin.scores.bootstrap import MIN_RECORDS, bootstrap_means
-from retwin.twins import Parameter, ParameterShift, State, StateTwin
+from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics
-
-TANK = StateTwin(
-    (State("level", "m", 0.5, 0.0, 3.0),),
-    lambda x, u: x.level,
-    rt.Channels(("pump",), ("V",)),
-    rt.Channels(("level",), ("m",)),
-    1.0,
-    derivative=lambda x, u, p: (0.1 * u.pump - p.drain * x.level,),
-    parameters=(Parameter("drain", "1/s", 0.01, 1.0, 0.1),),
-)
-
-
-def recorded(seed: int) -> rt.Trajectories:
-    rng = np.random.default_rng(seed)
-    pump = np.repeat(rng.uniform(0.0, 2.0, size=(1, 20, 1)), 20, axis=1)
-    made = TANK.simulate(pump, seed=0, parameters={"drain": 0.13})
-    return made.replace(observed=made.observed + 0.01 * rng.normal(size=made.observed.shape))
 
 
 @pytest.fixture(scope="module")

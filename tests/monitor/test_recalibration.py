@@ -6,42 +6,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from leaking_tank import TANK, recorded
 from typer.testing import CliRunner
 
 import retwin as rt
 from retwin.cli.monitor import app
 from retwin.errors import InputError
 from retwin.monitor import Live, Monitor, Registry, Samples, Store, fit_monitor, recalibrate
-from retwin.twins import Parameter, State, StateTwin
 from retwin.update import Dynamics, Library, fit_dynamics
 
 SECOND, BEGIN = 10**9, 1_700_000_000 * 10**9
-TANK = StateTwin(
-    (State("level", "m", 0.5, 0.0, 3.0),),
-    lambda x, u: x.level,
-    rt.Channels(("pump",), ("V",)),
-    rt.Channels(("level",), ("m",)),
-    1.0,
-    derivative=lambda x, u, p: (0.1 * u.pump - p.drain * x.level,),
-    parameters=(Parameter("drain", "1/s", 0.01, 1.0, 0.1),),
-)
 
 
-def recorded(seed: int, steps: int, offset: slice | None = None) -> rt.Trajectories:
-    rng = np.random.default_rng(seed)
-    pump = np.repeat(rng.uniform(0.0, 2.0, size=(1, steps // 20, 1)), 20, axis=1)
-    made = TANK.simulate(pump, seed=0, parameters={"drain": 0.13})
-    observed = made.observed + 0.01 * rng.normal(size=made.observed.shape)
-    if offset is not None:
-        observed[:, offset] += 0.2
+def shifted(seed: int, steps: int, part: slice) -> rt.Trajectories:
+    """A record whose sensor is off by 0.2 m in a part of it."""
+    made = recorded(seed, steps=steps)
+    observed = made.observed.copy()
+    observed[:, part] += 0.2
     return made.replace(observed=observed)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    twin = fit_dynamics(TANK, recorded(0, 400), Dynamics(Library(0, (), False))).twin
+    twin = fit_dynamics(TANK, recorded(0), Dynamics(Library(0, (), False))).twin
     made = tmp_path_factory.mktemp("monitor") / "watch"
-    fit_monitor(twin, recorded(1, 800), "1 per day").save(made)
+    fit_monitor(twin, recorded(1, steps=800), "1 per day").save(made)
     return made
 
 
@@ -57,7 +46,7 @@ def watched(place: Path, folder: Path, record: rt.Trajectories) -> Store:
 
 
 def test_quiet_hours_make_a_version_in_the_shadow(tmp_path: Path, folder: Path) -> None:
-    with watched(tmp_path / "s", folder, recorded(5, 1600, slice(600, 700))) as store:
+    with watched(tmp_path / "s", folder, shifted(5, 1600, slice(600, 700))) as store:
         assert list(store.log("end"))
         version = recalibrate(store, "a")
         assert (version.number, version.state) == (2, "shadow")
@@ -69,7 +58,7 @@ def test_quiet_hours_make_a_version_in_the_shadow(tmp_path: Path, folder: Path) 
 
 
 def test_too_short_a_quiet_time_is_refused(tmp_path: Path, folder: Path) -> None:
-    with watched(tmp_path / "s", folder, recorded(5, 300)) as store:
+    with watched(tmp_path / "s", folder, recorded(5, steps=300)) as store:
         with pytest.raises(InputError, match="at least 320 s outside of events"):
             recalibrate(store, "a")
         with pytest.raises(InputError, match="one of a"):
@@ -78,7 +67,7 @@ def test_too_short_a_quiet_time_is_refused(tmp_path: Path, folder: Path) -> None
 
 def test_two_parts_that_can_be_compared_are_enough(tmp_path: Path, folder: Path) -> None:
     for samples, enough in ((319, False), (320, True)):
-        record = recorded(5, 340)[:].between(0.0, float(samples))
+        record = recorded(5, steps=340)[:].between(0.0, float(samples))
         with watched(tmp_path / str(samples), folder, record) as store:
             if enough:
                 assert recalibrate(store, "a").state == "shadow"
@@ -88,7 +77,7 @@ def test_two_parts_that_can_be_compared_are_enough(tmp_path: Path, folder: Path)
 
 
 def test_an_event_that_lasts_needs_the_word_that_it_is_normal(tmp_path: Path, folder: Path) -> None:
-    store = watched(tmp_path / "s", folder, recorded(5, 1600, slice(600, None)))
+    store = watched(tmp_path / "s", folder, shifted(5, 1600, slice(600, None)))
     with store, pytest.raises(InputError, match="new normal") as error:
         recalibrate(store, "a")
     # What is known of the event is stated where somebody has to decide what it is.

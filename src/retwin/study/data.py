@@ -113,7 +113,7 @@ def real_data(
         real = read(data.real)
     elif case.emulator is not None:
         seed = plan.seed_of("emulated", 0)
-        real = _emulated(case, plan.emulated_healthy, seed)
+        real = _emulate(case, plan.emulated_healthy, seed)
     else:
         raise InputError(
             "real data",
@@ -127,7 +127,7 @@ def real_data(
     return real, Roles.of((first[fit], first[test]) for fit, test in folds)
 
 
-def _emulated(case: Case, healthy: int, seed: int) -> Trajectories:
+def _emulate(case: Case, healthy: int, seed: int) -> Trajectories:
     """Few runs of each fault, and so many healthy ones."""
     first, second = np.random.SeedSequence(seed).spawn(2)
     seeds = [int(each.generate_state(1)[0]) for each in (first, second)]

@@ -115,7 +115,7 @@ def _events(store: Store, asset: str, new_normal: str) -> tuple[int, list[tuple[
         expected="a machine that is as it was, or the name of who says that its change is normal",
         got="an event that "
         + ("lasts" if lasting else "did not end until it was a change")
-        + (f": {_known(store, asset, last)}" if last is not None else ""),
+        + (f": {_describe_event(store, asset, last)}" if last is not None else ""),
         remedy="find out whether it is a fault, and repair that; if it is the new normal, say so "
         "with your name: --new-normal NAME",
     )
@@ -123,7 +123,7 @@ def _events(store: Store, asset: str, new_normal: str) -> tuple[int, list[tuple[
     return int(begun), [(start, end) for start, end in closed.items() if start > begun]
 
 
-def _known(store: Store, asset: str, event: int) -> str:
+def _describe_event(store: Store, asset: str, event: int) -> str:
     """What the log says of an event of a machine, from which somebody decides what it is."""
     alarms, found = set[int](), list[str]()
     for entry in store.log():

@@ -17,11 +17,9 @@ RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
 """False-alarm rates that the page shows."""
 TRAJECTORIES, FAULTY, MISSED = 1000, 0.02, 50
 """The example: trajectories, share of faulty ones, cost of a missed fault in false alarms."""
-HEADS: list[object] = ["Requested false-alarm rate", "Alarm threshold", "Its false alarms"]
-HEADS += ["Faults detected", "Detected at the rate", "of these, correct class"]
-HEADS += [text_column("Most often missed"), text_column("Most often confused")]
-HEADS += grouped(f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty", f"cost, 1 : {MISSED}")
-"""Heads of the table of all rates; that of all sources begins with the fourth."""
+DETECTED = ("Faults detected", "Detected at the rate", "of these, correct class")
+COST = grouped(f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty", f"cost, 1 : {MISSED}")
+"""Heads of columns of both tables."""
 
 
 def _alarms(study: Study, source: str) -> tuple[float, Decision] | None:
@@ -79,33 +77,48 @@ def decisions(study: Study) -> Section | None:
 
 def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
     """A row per source at the same false-alarm rate."""
-    rows = [
-        [Cell(source_name(name), source=name), *_row(study.decision(name, rate), 3)[3:]]
-        for name in sources
-    ]
-    return tabulate("All sources at the same false-alarm rate", ["Source", *HEADS[3:]], rows)
+    heads = ["Source", *DETECTED, *map(text_column, ("Most often missed", "Most often confused"))]
+    rows = []
+    for name in sources:
+        each = study.decision(name, rate)
+        cells = *_detected(each), *_errors(each), _cost(each)
+        rows.append([Cell(source_name(name), source=name), *cells])
+    return tabulate("All sources at the same false-alarm rate", [*heads, *COST], rows)
 
 
 def _table(source: str, found: list[Decision]) -> Table:
+    """A row per false-alarm rate."""
+    heads = ["Requested false-alarm rate", "Alarm threshold", "Its false alarms", *DETECTED, *COST]
     digits = distinct(each.threshold for each in found)
     title = f"Cost of a false-alarm rate, {source_name(source)}"
-    rows = [_row(each, digits) for each in found]
-    return tabulate(title, HEADS[:6] + HEADS[8:], [[*row[:6], *row[8:]] for row in rows])
-
-
-def _row(each: Decision, digits: int) -> list[object]:
-    cost = each.cost(trajectories=TRAJECTORIES, faulty=FAULTY, missed=MISSED)
-    return [
-        percent(each.requested),
-        number(each.threshold, digits),
-        percents(each.false_alarms),
-        Cell(percent(each.detected), f"[{percents(each.interval)}]"),
-        percents(each.at_rate),
-        percent(each.identified),
-        class_name(each.most_missed) or "none",
-        " as ".join(map(class_name, each.most_confused)) or "none",
-        number(cost.total, 0),
+    rows = [
+        [
+            percent(each.requested),
+            number(each.threshold, digits),
+            percents(each.false_alarms),
+            *_detected(each),
+            _cost(each),
+        ]
+        for each in found
     ]
+    return tabulate(title, heads, rows)
+
+
+def _detected(each: Decision) -> list[object]:
+    """The cells of `DETECTED`."""
+    shown = Cell(percent(each.detected), f"[{percents(each.interval)}]")
+    return [shown, percents(each.at_rate), percent(each.identified)]
+
+
+def _errors(each: Decision) -> list[str]:
+    """The fault that is most often missed, and the diagnosis that is most often wrong."""
+    errors = class_name(each.most_missed), " as ".join(map(class_name, each.most_confused))
+    return [error or "none" for error in errors]
+
+
+def _cost(each: Decision) -> str:
+    """The cell of `COST`."""
+    return number(each.cost(trajectories=TRAJECTORIES, faulty=FAULTY, missed=MISSED).total, 0)
 
 
 def _calculator(study: Study, sources: list[str], first: str, healthy: int) -> dict[str, Any]:
@@ -130,7 +143,9 @@ def _calculator(study: Study, sources: list[str], first: str, healthy: int) -> d
 
 def _entry(each: Decision, digits: int) -> dict[str, Any]:
     """The numbers that costs are computed from, and the texts of the table's cells."""
-    (cells,) = tabulate("", [], [_row(each, digits)[1:8]]).rows
+    threshold = number(each.threshold, digits)
+    row = [threshold, percents(each.false_alarms), *_detected(each), *_errors(each)]
+    (cells,) = tabulate("", [], [row]).rows
     return {
         "rate": each.guaranteed,
         "detected": each.detected,
