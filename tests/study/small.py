@@ -8,7 +8,7 @@ from dataclasses import replace
 import retwin as rt
 from retwin.nets.training import Training
 
-PLAN = rt.StudyPlan(runs=2, per_class=10, folds=2, seed=3, overlaid=4)
+PLAN = rt.StudyPlan(runs=2, per_class=10, folds=2, seed=3, simulated=4, overlaid=4)
 BRISK = Training(max_epochs=6, batch_size=256, learning_rate=1e-2)
 """A surrogate that is good to a millimetre, in a second; the default one has a test of its own."""
 

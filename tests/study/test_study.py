@@ -301,6 +301,8 @@ def test_a_study_that_cannot_be_is_refused_at_once(case: rt.Case, tmp_path: Path
         ({"runs": float("nan")}, "runs: expected a whole number from 1 to 1000, got nan"),
         ({"per_class": 0}, "per_class: expected a whole number from 1 to 10000000"),
         ({"emulated_healthy": 0}, "emulated_healthy: expected a whole number from 1"),
+        ({"calibrated": 0}, "calibrated: expected a whole number of at least 1"),
+        ({"simulated": 0}, "simulated: expected a whole number of at least 1"),
         ({"overlaid": 0}, "overlaid: expected a whole number of at least 1"),
         ({"folds": 1}, "folds: expected a whole number of at least 2"),
         ({"seed": -1}, "seed: expected a whole number of at least 0"),

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LRScheduler, MultiStepLR, OneCycleLR
-from torch.utils.data import (
-    BatchSampler,
-    DataLoader,
-    RandomSampler,
-    SequentialSampler,
-    TensorDataset,
-)
 
 from retwin.checks import finite, one_of, positive, whole
 from retwin.progress import Progress
@@ -166,19 +158,17 @@ def train(
         The loss of a training batch is not finite; the message names the epoch.
 
     """
-    fitted = _loader(training_set, how.batch_size, torch.Generator().manual_seed(seed))
-    held_out = None
-    if validation_set is not None:
-        held_out = _loader(validation_set, 4 * how.batch_size, None)
+    generator = torch.Generator().manual_seed(seed)
+    steps = math.ceil(len(training_set[0]) / how.batch_size) * how.max_epochs
     history: dict[str, list[float]] = {"train": [], "validation": []}
     best, best_epoch, weights = math.inf, 0, None
     reason = ""
     network.cpu()
     with isolated(seed):
-        optimiser = _Optimiser(network, how, steps=len(fitted) * how.max_epochs)
+        optimiser = _Optimiser(network, how, steps=steps)
         for epoch in range(1, how.max_epochs + 1):
             losses = []
-            for batch in _batches(fitted):
+            for batch in _batches(training_set, how.batch_size, generator):
                 value = loss(network, batch)
                 if not torch.isfinite(value):
                     raise RuntimeError(
@@ -188,7 +178,8 @@ def train(
                 optimiser.step(value)
                 losses.append(value.detach())
             history["train"].append(torch.stack(losses).mean().item())
-            if held_out is not None:
+            if validation_set is not None:
+                held_out = _batches(validation_set, 4 * how.batch_size, None)
                 history["validation"].append(_validation_loss(network, loss, held_out))
                 if history["validation"][-1] < best:
                     best, best_epoch = history["validation"][-1], epoch
@@ -235,37 +226,29 @@ class _Optimiser:
 
 
 @torch.no_grad()
-def _validation_loss(network: nn.Module, loss: Loss, loader: DataLoader) -> float:
+def _validation_loss(
+    network: nn.Module, loss: Loss, batches: Iterable[tuple[Tensor, ...]]
+) -> float:
     """Mean loss per example in evaluation mode; every module then returns to the mode it was in."""
     modes = {module: module.training for module in network.modules()}
     network.eval()
-    weighted = [(len(batch[0]), loss(network, batch).item()) for batch in _batches(loader)]
+    weighted = [(len(batch[0]), loss(network, batch).item()) for batch in batches]
     for module, mode in modes.items():
         module.training = mode
     return sum(size * value for size, value in weighted) / sum(size for size, _ in weighted)
 
 
-def _loader(
+def _batches(
     tensors: tuple[Tensor, ...], batch_size: int, generator: torch.Generator | None
-) -> DataLoader:
-    """Batches in random order, or in the data's where there is no generator.
+) -> Iterator[tuple[Tensor, ...]]:
+    """The batches of one epoch in random order, or in the data's where there is no generator.
 
-    The sampler gives the indices of a whole batch: to collate single examples would cost more time
-    than the network.
+    Indices stay tensors: torch's `DataLoader` takes them as lists of Python, which costs as much
+    time as a small network.
     """
-    examples = TensorDataset(*tensors)
-    order = (
-        SequentialSampler(examples)
-        if generator is None
-        else RandomSampler(examples, generator=generator)
-    )
-    return DataLoader(examples, sampler=BatchSampler(order, batch_size, False), batch_size=None)
-
-
-def _batches(loader: DataLoader) -> Iterator[tuple[Tensor, ...]]:
-    """The batches of one epoch.
-
-    The sampler would draw another permutation if it were asked for a batch after the last, which
-    would change the order of the epochs that follow.
-    """
-    return map(tuple, islice(loader, len(loader)))
+    examples = len(tensors[0])
+    if generator is None:
+        yield from zip(*(each.split(batch_size) for each in tensors), strict=True)
+        return
+    for index in torch.randperm(examples, generator=generator).split(batch_size):
+        yield tuple(each[index] for each in tensors)

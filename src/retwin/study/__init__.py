@@ -237,6 +237,7 @@ def _prepare(
     file marks the folder as complete.
     """
     real, roles = real_data(case, plan, data, report)
+    roles = roles.first_of_each(real.labels, plan.calibrated)
     _check_healthy(plan, real, roles)
     twin = twin_data(case, plan, data, report)
     remedy = "give more of them, or a larger per_class"

@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from retwin.data.io import load
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.files import write_json
@@ -30,6 +33,15 @@ class Roles:
     def of(cls, folds: Iterable[tuple[Iterable[int], Iterable[int]]]) -> Roles:
         """From any pairs (calibration, test) of indices."""
         return cls(tuple((_indices(calibration), _indices(test)) for calibration, test in folds))
+
+    def first_of_each(self, labels: NDArray, count: int | None) -> Roles:
+        """The roles with so many calibration trajectories of each class and fold; None: all."""
+
+        def first(part: NDArray) -> list[int]:
+            found = labels[part]
+            return sorted(i for label in np.unique(found) for i in part[found == label][:count])
+
+        return Roles.of((first(np.array(part, dtype=int)), test) for part, test in self.folds)
 
     @property
     def tested(self) -> list[int]:

@@ -80,9 +80,14 @@ class StudyPlan:
         Whether sources that are calibrated on healthy trajectories are also calibrated on fewer.
     emulated_healthy : int
         Healthy trajectories of the emulated set that stands in for a real one, at least 1.
-    overlaid : int, optional
-        Test trajectories per class and fold that are simulated for the fidelity and for the
+    calibrated : int, optional
+        Trajectories of each class in the calibration part of a fold, at least 1; by default all
+        that the fold does not test.
+    simulated : int, optional
+        Healthy test trajectories per fold that are simulated for the fidelity and for the
         predictive overlay, at least 1; by default all. Diagnoses are of all in any case.
+    overlaid : int, optional
+        The same for faulty ones, per class and fold, which only the predictive overlay shows.
     ablations : bool
         Whether the fidelity of a residual model is compared with that of simpler ones, and whether
         its bands are widened by held-out trajectories: two further fits in each fold.
@@ -106,6 +111,8 @@ class StudyPlan:
     encoder_noise: float = 0.0
     learning_curve: bool = False
     emulated_healthy: int = 10
+    calibrated: int | None = None
+    simulated: int | None = None
     overlaid: int | None = None
     ablations: bool = True
 
@@ -130,8 +137,9 @@ class StudyPlan:
         if self.rate is not None:
             sample_rate("rate", self.rate)
         whole("emulated_healthy", self.emulated_healthy, least=1, most=MAX_PER_CLASS)
-        if self.overlaid is not None:
-            whole("overlaid", self.overlaid, least=1)
+        for name in ("calibrated", "simulated", "overlaid"):
+            if (count := getattr(self, name)) is not None:
+                whole(name, count, least=1)
         finite("encoder_noise", self.encoder_noise, least=0.0, unit="command units")
 
     def generated(self, case: Case) -> int:

@@ -305,7 +305,7 @@ class Work:
 
     def _fidelity(self, trial: Trial, path: Path) -> Costs:
         """Compare the twin of a source with the healthy test trajectories of the fold."""
-        healthy = self.files.real_data()[self._overlaid(trial)].with_label(HEALTHY)
+        healthy = self.files.real_data()[self._simulated(trial, HEALTHY)]
         if len(healthy) == 0:
             with write_atomically(path) as part:
                 np.savez(part)  # an empty file marks the job as done
@@ -330,17 +330,18 @@ class Work:
 
     def _overlay(self, trial: Trial, path: Path) -> Costs:
         """The predictive overlay of the fold's test trajectories, for display and no score."""
-        twin, test = _source_twin(trial), self.files.real_data()[self._overlaid(trial)]
+        labels = np.unique(self._labels[list(trial.fold[1])])
+        shown = {i for label in labels for i in self._simulated(trial, label)}
+        twin, test = _source_twin(trial), self.files.real_data()[sorted(shown)]
         assert isinstance(twin, CorrectedTwin), 'as all whose role is "updated"'
         seed, rate = trial.seed("portrait"), self.case.sensor_rate
         predictive_overlay(twin, test, seed=seed, rate=rate, progress=trial.progress).save(path)
         return {}
 
-    def _overlaid(self, trial: Trial) -> list[int]:
-        """The test trajectories of the fold that are simulated, the first ones of each class."""
-        tested, labels = np.array(trial.fold[1], dtype=int), self._labels
-        classes = [tested[labels[tested] == label] for label in np.unique(labels[tested])]
-        return sorted(i for each in classes for i in each[: self.plan.overlaid].tolist())
+    def _simulated(self, trial: Trial, label: str) -> list[int]:
+        """The first test trajectories of a class, as many as the plan simulates."""
+        count = self.plan.simulated if label == HEALTHY else self.plan.overlaid
+        return [i for i in sorted(trial.fold[1]) if self._labels[i] == label][:count]
 
     def _rivals(self, trial: Trial, twin: CorrectedTwin) -> dict[str, Twin]:
         """Ablations of the residual model: its mean alone, and a single Gaussian."""

@@ -273,7 +273,8 @@ def fit_surrogate(
     def loss(module: Any, batch: tuple[Tensor, ...]) -> Tensor:
         commands, nominal, valid_samples = batch
         error = module.network(module.before(commands)) - module.after(nominal)
-        return error[valid_samples].square().mean()
+        squares = error.square().mean(dim=-1)
+        return (squares * valid_samples).sum() / valid_samples.sum()
 
     result = train(
         surrogate,

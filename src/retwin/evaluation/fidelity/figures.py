@@ -35,6 +35,8 @@ SHOWN_BINS = 20
 """Bins of a PIT histogram on a page, of which each joins several of the computed ones."""
 MIN_TRAJECTORIES = 8
 """Least number of trajectories for the classifier two-sample test: fewer do not train it."""
+FOLDS = 5
+"""Folds of its cross-validation, as scikit-learn's default."""
 MAX_PLACES = 512
 """Largest number of values at which two distributions are compared, which bounds the memory."""
 _KEYS = {
@@ -328,7 +330,7 @@ class Fidelity:
         measured = np.tile(np.arange(members) == 0, n)
         group = np.repeat(np.arange(n), members)
         scores = np.empty(len(rows))
-        for train, test in GroupKFold(min(n, 10)).split(rows, measured, group):
+        for train, test in GroupKFold(min(n, FOLDS)).split(rows, measured, group):
             forest = ExtraTreesClassifier(100, class_weight="balanced", random_state=0)
             forest.fit(rows[train], measured[train])
             scores[test] = forest.predict_proba(rows[test])[:, 1]

@@ -443,9 +443,8 @@ class CommandProblem:
         )
         if made is None:
             return None
-        different, place, jacobian = made
-        outputs = self.surrogate(different[None])[0, place].double()
-        return self.observed - outputs / self.unit, jacobian
+        outputs, jacobian = made
+        return self.observed - outputs, jacobian
 
     def _effective(self, x: Tensor, rows: Tensor) -> Tensor:
         """Effective commands for x (k, M, size) of the trajectories `rows` (k,), in order."""

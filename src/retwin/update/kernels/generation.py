@@ -119,17 +119,16 @@ def linearised_outputs(
     *,
     unit: Tensor,
     step: float,
-) -> tuple[Tensor, Tensor, Tensor] | None:
-    """The effective commands of `CommandProblem`, and the Jacobian of the outputs by x.
+) -> tuple[Tensor, Tensor] | None:
+    """The outputs that `CommandProblem` predicts, and their Jacobian by x.
 
     See there for the arguments; finite differences of the commands have the step `step`.
 
     Returns
     -------
     Tensor
-        (k, d_u), single precision, the commands that differ from the sample before.
-    Tensor
-        (n, S), the row of it that each sample's commands are.
+        (n, S, d_y), the outputs in `unit`, which the network computes in single precision. None
+        depends on the other trajectories.
     Tensor
         (n, S, d_y, P), the derivatives of the outputs in `unit`.
 
@@ -141,9 +140,8 @@ def linearised_outputs(
     if not samples:
         return None
     count, own = segments.max_count, x.shape[1] > segments.max_count * (1 + width)
-    points = np.empty((n, samples, width), np.float32)
-    kept, place = np.empty(n, np.int64), np.empty((n, samples), np.int64)
-    jacobian = np.empty((n, samples, outputs, x.shape[1]))
+    found = np.empty((n, samples, outputs))
+    jacobian = np.empty((*found.shape, x.shape[1]))
     size = reference.abs().amax(dim=0).amax(dim=0).clamp_min(1e-12)
     given = (
         _doubles(reference),
@@ -156,11 +154,9 @@ def linearised_outputs(
         (n, steps, count, samples, int(own)),
         step,
         (*packed[:2], _doubles(size), _doubles(unit)),
-        (*given, points, kept, place, jacobian),
+        (*given, found, jacobian),
     )
-    different = points[np.arange(samples) < kept[:, None]]
-    place += (kept.cumsum() - kept)[:, None]
-    return torch.from_numpy(different), torch.from_numpy(place), torch.from_numpy(jacobian)
+    return torch.from_numpy(found), torch.from_numpy(jacobian)
 
 
 def delayed_path(segments: Segments, path: Tensor, z: Tensor) -> Tensor | None:

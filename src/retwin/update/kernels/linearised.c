@@ -66,10 +66,10 @@ static void executed_commands(executor e, const double *x, const double *missed,
     }
 }
 
-/* Of one row: the commands that differ from the sample before, in single precision, `place` of each
-   sample among them, and the network's Jacobian there. Returns their number. */
-static i64 different(network net, i64 samples, const double *now, float *points, i64 *place,
-                     float *outputs, float *by_command, void *scratch)
+/* Of one row: the network's outputs and Jacobian at the commands that differ from the sample before,
+   in single precision, and the `place` of each sample among them. */
+static void different(network net, i64 samples, const double *now, float *points, i64 *place,
+                      float *outputs, float *by_command, void *scratch)
 {
     i64 d = net.widths[0], count = 0;
     for (i64 k = 0; k < samples; k++) {
@@ -79,18 +79,16 @@ static i64 different(network net, i64 samples, const double *now, float *points,
         place[k] = count - 1;
     }
     sloped(net, count, points, outputs, by_command, scratch);
-    return count;
 }
 
-/* Commands (n, S, d_u) that differ from those before, their number (n,), the place (n, S) of each
-   sample's among them, and the Jacobian (n, S, d_y, P) by x (n, P). The times of a row are in
-   order. */
+/* Outputs (n, S, d_y) and their Jacobian (n, S, d_y, P) by x (n, P), both in `unit`. The times of a
+   row are in order. */
 EXPORT void linearised(i64 n, i64 steps, i64 segments, i64 samples, i64 own, double step,
                        const i64 *widths, const float *numbers, const double *size,
                        const double *unit, const double *reference, const double *start,
                        const double *settle, const i64 *count, const double *x,
                        const double *missed, const double *frozen, const double *times,
-                       float *points, i64 *kept, i64 *place, double *jacobian)
+                       double *found, double *jacobian)
 {
     network net = unpacked(widths, numbers);
     i64 d = net.widths[0], outputs = net.widths[net.layers], all = samples * d;
@@ -100,11 +98,11 @@ EXPORT void linearised(i64 n, i64 steps, i64 segments, i64 samples, i64 own, dou
     double *z = room + doubles_of(segments, d), *some = z + segments * (1 + 2 * d);
     double *now = some + samples, *late = now + all, *off = late + all;
     double *moved = off + all, *columns = moved + latent;
-    float *values = malloc(samples * outputs * (1 + d) * sizeof(float));
-    float *by_command = values + samples * outputs;
+    float *values = malloc((samples * outputs * (1 + d) + all) * sizeof(float));
+    float *by_command = values + samples * outputs, *points = by_command + samples * outputs * d;
     void *scratch = malloc(sloped_bytes(net));
-    i64 *ends = malloc((2 * segments + 1) * sizeof(i64));
-    for (i64 row = 0; row < n; row++, reference += steps * d, x += latent, points += all) {
+    i64 *ends = malloc((2 * segments + samples + 1) * sizeof(i64)), *at = ends + 2 * segments;
+    for (i64 row = 0; row < n; row++, reference += steps * d, x += latent) {
         if (own)
             for (i64 t = 0; t < steps; t++)
                 for (i64 c = 0; c < d; c++) columns[c * steps + t] = reference[t * d + c];
@@ -113,13 +111,14 @@ EXPORT void linearised(i64 n, i64 steps, i64 segments, i64 samples, i64 own, dou
                       frozen + row * d, times + row * samples, room, z, some, ends,
                       ends + segments};
         const double *without = missed + row * segments * d;
-        i64 *at = place + row * samples;
         for (i64 m = 0; m < segments; m++) {
             e.first[m] = samples;
             e.end[m] = 0;
         }
         executed_commands(e, x, without, 0, samples, step, now);
-        kept[row] = different(net, samples, now, points, at, values, by_command, scratch);
+        different(net, samples, now, points, at, values, by_command, scratch);
+        for (i64 k = 0; k < samples; k++, found += outputs)
+            for (i64 o = 0; o < outputs; o++) found[o] = values[at[k] * outputs + o] / unit[o];
         memcpy(moved, x, latent * sizeof(double));
         memset(jacobian, 0, samples * outputs * latent * sizeof(double));
         for (i64 m = 0; m < e.count; m++) {
