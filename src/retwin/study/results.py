@@ -370,22 +370,21 @@ def _poses(work: Work, test: Trajectories, overlay: Overlay | None = None) -> di
     if body is None:
         return {}
     every = max(1, round(test.rate / work.case.sensor_rate))
-    nominal, observed = (body.skeleton(joints[:, ::every]) for joints in body.poses(test))
+    names = ("commands", "nominal", "observed", "mask")
+    slow = Trajectories(
+        **{name: getattr(test, name)[:, ::every] for name in names},
+        rate=test.rate / every,
+        inputs=test.inputs,
+        outputs=test.outputs,
+    )
+    nominal, observed = map(body.skeleton, body.poses(slow))
     found = {"pose/nominal": nominal, "pose/observed": observed}
     if overlay is not None:
-        names = overlay.ids.tolist()
-        order = [names.index(name) for name in test.ids.tolist()]
-        median = overlay.bands[order, 2]
-        slow = Trajectories(
-            commands=test.commands[:, ::every],
-            nominal=test.nominal[:, ::every],
-            observed=median.astype(test.observed.dtype),
-            mask=np.ones(median.shape, dtype=bool),
-            rate=test.rate / every,
-            inputs=test.inputs,
-            outputs=test.outputs,
-        )
-        found["pose/updated"] = body.skeleton(body.poses(slow)[1])
+        ids = overlay.ids.tolist()
+        order = [ids.index(name) for name in test.ids.tolist()]
+        median = overlay.bands[order, 2].astype(slow.observed.dtype)
+        predicted = slow.replace(observed=median, mask=np.ones(median.shape, dtype=bool))
+        found["pose/updated"] = body.skeleton(body.poses(predicted)[1])
     return {name: each.astype(np.float32) for name, each in found.items()}
 
 

@@ -28,10 +28,8 @@ It is so small that the end-effector is met to a few µm. Near the straight pose
 hardly affects the end-effector, it keeps the yaw at its command.
 """
 GAUSS_NEWTON_STEPS = 8
-"""Largest number of damped Gauss-Newton steps per sample; they suffice since each sample starts at
-the pose of the sample before."""
-TOLERANCE = 1e-5
-"""Step in rad that ends the search: it moves the end-effector of an arm of 0.5 m by 5 µm."""
+"""Number of damped Gauss-Newton steps per sample; they suffice since each sample starts at the
+pose of the sample before."""
 SWITCH_RATIO = 0.5
 """Ratio of costs below which the pose found from the command replaces the one that continues the
 motion. Without this margin the picture would flicker between two poses of similar cost."""
@@ -159,7 +157,7 @@ def _descend(
         error = np.concatenate([arm.position(pose) - tip, deviation], axis=-1)
         return error, np.concatenate([arm.jacobian(pose), stay], axis=-2)
 
-    return gauss_newton(evaluate, start, rounds=GAUSS_NEWTON_STEPS, tolerance=TOLERANCE)
+    return gauss_newton(evaluate, start, rounds=GAUSS_NEWTON_STEPS)
 
 
 def _interpolated(trajectories: Trajectories) -> NDArray:

@@ -18,7 +18,6 @@ def gauss_newton(
     rounds: int,
     limit: float = np.inf,
     damping: float = 1e-4,
-    tolerance: float = 0.0,
 ) -> tuple[NDArray, NDArray]:
     """Minimise sums of squares from given starts.
 
@@ -36,8 +35,6 @@ def gauss_newton(
     damping : float, optional
         Damping of the first step, relative to the trace of the normal matrix (Levenberg,
         Marquardt).
-    tolerance : float, optional
-        The search ends earlier when no step changes any x by more.
 
     Returns
     -------
@@ -57,8 +54,6 @@ def gauss_newton(
         damped = matrix + (size * (ratio + FLOOR))[..., None, None] * np.eye(x.shape[-1])
         step = np.linalg.solve(damped, transposed @ error[..., None])[..., 0]
         trial = np.clip(x - step, -limit, limit)
-        if (np.abs(trial - x) < tolerance).all():
-            break
         trial_error, trial_slope = evaluate(trial)
         trial_cost = (trial_error**2).sum(axis=-1)
         better = trial_cost < cost
