@@ -103,8 +103,8 @@ def test_numbers(study: Study, write: Write) -> None:
     assert "7.86 (16.6)" in text
     assert "< 0.001" in text
     assert "0.420" in text  # surrogate RMSE in mm
-    assert "9 of 200 observed" in text  # unidentified delays are no observations
-    assert "9 of 240 observed" in text
+    assert "Outside: 9 of 200;" in text  # unidentified delays are no observations
+    assert "Outside: 9 of 240;" in text
     assert "real data: healthy only; fault protocol known" in text
     assert results["provenance"]["command"] in text
     assert "a1" * 32 in text
@@ -231,9 +231,9 @@ def test_the_model_card_knows_what_went_wrong(study: Study, write: Write) -> Non
         "2 s at 100 Hz; bands and plots at 10 Hz",
         "10 Healthy",
         "10 real trajectories",
-        "Healthy diagnosed as M1 stuck real_a/003",
-        "M4 bias recognised in 40%",
-        "Noise x: generated and observed distributions differ KS distance 0.98, p 0.05",
+        "Healthy M1 stuck real_a/003",
+        "M4 bias recognised in 40% of the diagnoses of all runs",
+        "Noise x generated and observed differ: KS distance 0.98, p 0.05",
         "Original twin; Updated twin (outputs): one chain did not mix",
         "Original twin: a command outside",
         "which would not be known in the field",
@@ -243,7 +243,7 @@ def test_the_model_card_knows_what_went_wrong(study: Study, write: Write) -> Non
     for name in [each for each in arrays if each.startswith("portrait/")]:
         del arrays[name]
     reader = read(write(study))
-    assert "Healthy diagnosed as M1 stuck real_a/003" in reader.text
+    assert "Healthy M1 stuck real_a/003" in reader.text
     assert "#trajectory=real_a%2F003" not in reader.addresses
 
 

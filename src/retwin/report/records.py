@@ -43,14 +43,15 @@ def records_part(checked: Checked) -> RecordsPart:
 def finding_rows(findings: Sequence[Finding]) -> list[tuple[str, str, str, str]]:
     """Record, channel, time and text of findings, and how many more there are.
 
-    Many of one kind in one channel are a row, with the figures of the first.
+    Those of one kind in one channel are a row, with the figures of the first; a few with times of
+    their own are not.
     """
     alike: dict[tuple[str, str], list[Finding]] = {}
     for each in findings:
         alike.setdefault((each.kind, each.channel), []).append(each)
     rows = []
     for own in alike.values():
-        if len(own) <= NAMED:
+        if len(own) == 1 or (own[0].time and len(own) <= NAMED):
             rows += [each.row for each in own]
         else:
             names = ", ".join(dict.fromkeys(each.row[0] for each in own))

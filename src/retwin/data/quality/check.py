@@ -39,13 +39,13 @@ class Checked:
 
     @property
     def sentences(self) -> list[str]:
-        """How much nominal outputs explain, in a sentence for each kind of record."""
-        made = []
+        """How much of the variance nominal outputs explain, in a sentence; none where unknown."""
+        parts = []
         for kind, shares in self.explained.items():
             own = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in shares.items())
             which = "" if len(self.explained) == 1 else f" in {kind} records"
-            made.append(f"The twin as it was given explains{which} {own} (share of the variance).")
-        return made
+            parts.append(f"{own}{which}")
+        return [f"The twin as it was given explains {'; '.join(parts)} (variance)."] * bool(parts)
 
     @property
     def values(self) -> dict[str, Any]:

@@ -17,6 +17,8 @@ from retwin.scores.classification import row_shares
 
 SIGNIFICANT = 0.05
 """The p-value at or below which generated and observed values count as different."""
+NAMED = 5
+"""Trajectories of one kind of wrong diagnosis that are named, at most."""
 POOR = 0.5
 """The recall below which a class counts as not recognised."""
 
@@ -69,6 +71,7 @@ def _scope(study: Study, source: str) -> dict[str, str]:
     used = calibration.n if calibration.used is None else len(calibration.used)
     counts = Counter(class_name(label) for label in test.labels if results.classes)
     tested = ", ".join(f"{count} {label}" for label, count in counts.items())
+    untested = results.classes if set(results.classes) - set(test.labels) else ()
     facts = {
         "system": results.title or results.case,
         "updated twin": source_name(source),
@@ -77,7 +80,7 @@ def _scope(study: Study, source: str) -> dict[str, str]:
         ),
         "commands": _channels(results.inputs),
         "outputs": _channels(results.outputs),
-        "classes": ", ".join(map(class_name, results.classes)),
+        "classes": ", ".join(map(class_name, untested)),
         "calibrated on": counted(used, f"{word} trajectory") if used else "",
         "tested on": tested or (counted(test.n, "trajectory") if test.n else ""),
         "trajectory length": _length(study),
@@ -138,11 +141,14 @@ def _missed(study: Study, source: str) -> list[tuple[str, float]]:
 
 
 def _trajectories(study: Study, names: Sequence[str]) -> Cell:
-    """Their ids, as links to the explorer where it shows them."""
+    """Their ids, as links to the explorer where it shows them; of many the number of the rest."""
     ids = study.results.data.test.ids
     shown = {ids[place] for place in study.results.overlaid} if study.explorable else set()
-    links = [Link(n, f"trajectory={quote(n, safe='')}" if n in shown else "") for n in names]
-    return Cell("", links=links)
+    links = [
+        Link(n, f"trajectory={quote(n, safe='')}" if n in shown else "") for n in names[:NAMED]
+    ]
+    more = len(names) - NAMED
+    return Cell("", links=[*links, *([Link(f"and {more} more", "")] if more > 0 else [])])
 
 
 def _setup(study: Study) -> dict[str, str]:

@@ -103,12 +103,16 @@ def _pairs(study: Study, found: Sequence[Comparison]) -> Table:
     last: tuple[str, str] | None = None
     oriented = _sorted(found)
     axes = _axes(study, oriented)
+    decided = any(outcome_of(each) for each in oriented)
     for each in oriented:
         if (each.a, each.b) != last:
             rows.append([f"{source_name(each.a)} minus {source_name(each.b)}"])
         last = each.a, each.b
         axis = axes.get(metric_quantity(each.metric, units)[1], (0.0, 0.0))
-        rows.append(_row(each, units, axis))
+        outcome = outcome_of(each)
+        named = {"open": "undecided", "": "no verdict"}.get(outcome, outcome)
+        shown = Cell(named if decided else "", tone=outcome)
+        rows.append([metric_name(each.metric), shown, *_row(each, units, axis)])
     return tabulate("Differences, pair by pair", heads, rows)
 
 
@@ -130,13 +134,10 @@ def _row(each: Comparison, units: Sequence[str], axis: tuple[float, float]) -> l
             for value in (each.interval[0], each.mean_diff, each.interval[1], 0.0)
         )
         forest = Forest(lower, min(max(at, 0), 100), upper, zero)
-    result = outcome_of(each)
     mean, interval = difference(each, units)
     # Draws that are all equal show no uncertainty, which does not mean that there is none.
     wide = each.interval is not None and each.interval[0] < each.interval[1]
     return [
-        metric_name(each.metric),
-        Cell({"open": "undecided", "": "no verdict"}.get(result, result), tone=result),
         mean,
         interval if wide else "–",
         Cell("", forest=forest, source=each.a),
