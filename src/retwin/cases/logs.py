@@ -21,7 +21,7 @@ from retwin.cases.named_signals import (
     signals_of,
 )
 from retwin.catalog import LOGS
-from retwin.checks import finite, require
+from retwin.checks import at_least, finite, require
 from retwin.data.io import load
 from retwin.data.logs.mapped import mapped
 from retwin.data.logs.mapping import NO_NOMINAL, TimeSettings, read_mapping
@@ -218,13 +218,7 @@ class LogReader:
         progress: Progress | None = None,
     ) -> Logs:
         """See `read_logs`."""
-        require(
-            paths,
-            "logs",
-            expected="one log at least",
-            got="none",
-            remedy="name the files with the measurements",
-        )
+        at_least("logs", paths, 1, "log", remedy="name the files with the measurements")
         self._check_columns(twin)
         notes: dict[str, list[str]] = {}
         sets, tests = [], []

@@ -190,13 +190,7 @@ def _chosen(known: Sequence[Known], free: Sequence[str], name: str) -> list[Para
     made = [_parameter(text, by_name, known) for text in free]
     names = [each.name for each in made]
     twice = sorted({each for each in names if names.count(each) > 1})
-    require(
-        not twice,
-        "--free",
-        expected="each parameter once",
-        got=f"{', '.join(twice)} twice",
-        remedy="leave one of them out",
-    )
+    nothing("--free", twice, "each parameter once", remedy="give each a range once")
     return made
 
 

@@ -10,7 +10,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TextIO
 
-from retwin.checks import require
+from retwin.checks import nothing, require
 from retwin.data.logs.signals import named_units
 from retwin.errors import InputError, brief
 
@@ -22,8 +22,6 @@ SEPARATORS = (";", "\t", ",", "|")
 """Separators in the order in which they are tried; blanks come last."""
 HEAD = 200
 """Lines in which the header and the first rows of numbers are looked for."""
-AGREEING = 12
-"""Rows that must have the same number of columns."""
 LONGEST = 2**20
 """Characters of a line at most."""
 NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf|nan", re.IGNORECASE)
@@ -167,11 +165,10 @@ def text_layout(
         tuple(unit or other for unit, (_, other) in zip(own, pairs, strict=True)),
     )
     missing = [each for each in wanted if each not in (*layout.titles, *names)]
-    require(
-        not missing,
+    nothing(
         place,
-        expected=f"a header with the columns {', '.join(wanted)}",
-        got=f"no column {', '.join(missing)}",
+        (f"no column {each}" for each in missing),
+        f"a header with the columns {', '.join(wanted)}",
         remedy="name the columns as the file does",
     )
     return layout
@@ -278,10 +275,17 @@ def _holds_numbers(row: Row, comma: bool) -> bool:
     return count > 0 and 2 * count >= len(filled)
 
 
-def _first_row(rows: Sequence[Row], *, comma: bool) -> int | None:
-    """The first row from which on all have the same number of cells, numbers among them."""
+def _first_row(rows: Sequence[Row], *, comma: bool, agreeing: int = 12) -> int | None:
+    """The first row from which on all have the same number of cells, numbers among them.
+
+    Parameters
+    ----------
+    agreeing : int, default 12
+        Rows that must have the same number of columns.
+
+    """
     for place, row in enumerate(rows):
-        following = [each for each in rows[place : place + AGREEING] if any(map(str.strip, each))]
+        following = [each for each in rows[place : place + agreeing] if any(map(str.strip, each))]
         # The last line may be cut off; the rows below say so when they are read.
         same = following[: max(1, len(following) - 1)]
         if any(map(str.strip, row)) and all(

@@ -21,8 +21,6 @@ COARSE = 25
 """Onsets of each segment that are evaluated first."""
 FINE = 8
 """Samples before and after the best of them that are evaluated one by one."""
-PASSES = 2
-"""Times that the outputs are explained for the best onset."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +110,16 @@ def _cells(samples: Tensor) -> Tensor:
 
 
 def _explained(
-    rows: Hypotheses, limits: Tensor, noise: Noise
+    rows: Hypotheses, limits: Tensor, noise: Noise, *, passes: int = 2
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Onsets (R, G) between limits, the log evidence of each times its cell; the best of them (R,),
     and its log evidence.
+
+    Parameters
+    ----------
+    passes : int, default 2
+        Times that the outputs are explained for the best onset.
+
     """
     first, last = (each[:, None] for each in limits.unbind(dim=1))
     empty = last < first
@@ -124,7 +128,7 @@ def _explained(
     samples = coarse = (first + (last - first) * share).round().long()
     x = rows.start
     objective = _objectives(rows, samples, x, None, noise)
-    for _ in range(PASSES):
+    for _ in range(passes):
         at = objective.argmin(dim=1, keepdim=True)
         best = samples.gather(1, at)
         problem = rows.held(best[:, 0]).problem

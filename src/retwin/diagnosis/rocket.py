@@ -37,8 +37,6 @@ KERNEL_LENGTH = 9
 PENALTIES = np.logspace(-1, 5, 13)
 """Penalties of the ridge among which leave-one-out chooses."""
 
-ABSENT = -2.0
-"""Score of a class that has no training example; scores of the others are near -1 and 1."""
 
 PARAMETERS = ("channels_per_kernel", "channels", "dilations", "per_dilation", "biases")
 """Fitted parameters of sktime's transform, in its order."""
@@ -204,8 +202,17 @@ class RocketDiagnoser:
         return cls(features, names, about["samples"], weights, about["figures"])
 
 
-def _ridge(convolved: NDArray, labels: NDArray, order: tuple[str, ...]) -> tuple[NDArray, NDArray]:
-    """Slope (classes, kernels) and level (classes,) of the scores of the classes in `order`."""
+def _ridge(
+    convolved: NDArray, labels: NDArray, order: tuple[str, ...], *, absent: float = -2.0
+) -> tuple[NDArray, NDArray]:
+    """Slope (classes, kernels) and level (classes,) of the scores of the classes in `order`.
+
+    Parameters
+    ----------
+    absent : float, default -2.0
+        Score of a class that has no training example; scores of the others are near -1 and 1.
+
+    """
     from sklearn.linear_model import RidgeCV
     from sklearn.preprocessing import StandardScaler
 
@@ -213,7 +220,7 @@ def _ridge(convolved: NDArray, labels: NDArray, order: tuple[str, ...]) -> tuple
     scaler = StandardScaler().fit(convolved)
     ridge = RidgeCV(alphas=PENALTIES).fit(scaler.transform(convolved), 2.0 * truth - 1)
     slope = ridge.coef_ / scaler.scale_
-    return slope, np.where(truth.any(axis=0), ridge.intercept_ - slope @ scaler.mean_, ABSENT)
+    return slope, np.where(truth.any(axis=0), ridge.intercept_ - slope @ scaler.mean_, absent)
 
 
 def _temperature(scores: NDArray, truth: NDArray) -> tuple[float, float]:

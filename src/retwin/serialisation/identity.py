@@ -16,18 +16,21 @@ import numpy as np
 
 from retwin.serialisation.files import sha256
 
-MAX_DEPTH = 12
-"""Levels of nested objects; of deeper ones only the class counts, which ends cycles."""
 
-
-def identity(value: object) -> str:
+def identity(value: object, *, max_depth: int = 12) -> str:
     """The SHA-256 of an object: its class, settings, arrays, weights and the contents of its files.
 
     An object whose files name other files has a text `fingerprint` that depends on those. Functions
     and classes count by their names. Pickle is not used, since its bytes depend on which parts are
     the same object, and not on the contents of files.
+
+    Parameters
+    ----------
+    max_depth : int, default 12
+        Levels of nested objects; of deeper ones only the class counts, which ends cycles.
+
     """
-    text = json.dumps(_described(value, MAX_DEPTH), sort_keys=True)
+    text = json.dumps(_described(value, max_depth), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -172,12 +172,9 @@ def _check(fps: float, size: tuple[int, int], renderer: str, *, least: tuple[int
 
 def _chosen(trajectories: Trajectories, case: Case, index: int | str) -> Trajectories:
     """The one trajectory at `index`."""
-    require(
-        trajectories.outputs == case.outputs,
-        "trajectories",
-        expected=f"outputs {list(case.outputs.names)}, as the case {case.name} has",
-        got=list(trajectories.outputs.names),
-        remedy="give the case that the data belong to",
+    remedy = "give the case that the data belong to"
+    agree(
+        "trajectories", trajectories, case, "those of the case", names=("outputs",), remedy=remedy
     )
     ids = trajectories.ids.tolist()
     expected = f"a position from 0 to {len(ids) - 1}" if ids else "a set that is not empty"

@@ -25,28 +25,23 @@ class DataCase(Protocol):
     @property
     def inputs(self) -> Channels:
         """Names and units of the commands."""
-        ...
 
     @property
     def outputs(self) -> Channels:
         """Names and units of the outputs."""
-        ...
 
     @property
     def rate(self) -> float:
         """Samples per second; 0 where any will do, as with a twin that has no rate of its own."""
-        ...
 
     @property
     def classes(self) -> tuple[str, ...]:
         """The class names, in their fixed order; () where any will do."""
-        ...
 
     def complete(
         self, trajectories: Trajectories, *, progress: Progress | None = None
     ) -> Trajectories:
         """`trajectories` with the commands that the file does not hold, and their channels."""
-        ...
 
 
 @dataclass(frozen=True)

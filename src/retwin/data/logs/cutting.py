@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import at_most, require
+from retwin.checks import at_least, at_most, require
 from retwin.data.logs.mapping import Cut
 from retwin.data.logs.signals import Signal
 from retwin.errors import InputError
@@ -56,13 +56,8 @@ def pieces(
 
     """
     times = union_of_times(signals)
-    require(
-        len(times),
-        "mapping",
-        expected="values of the signals that it names",
-        got="none",
-        remedy="map signals that the log has values of",
-    )
+    remedy = "map signals that the log has values of"
+    at_least("mapping", times, 1, "value of the signals that it names", remedy=remedy)
     whole = Piece(float(times[0]), float(times[-1]))
     if cut.by == "trigger":
         assert trigger is not None

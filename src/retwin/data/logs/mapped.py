@@ -27,9 +27,6 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-SPARSE = 100.0
-"""Samples per value of a log from which its times, or the sample rate, are wrong."""
-
 
 def read_mapped(
     path: Path,
@@ -307,14 +304,28 @@ def _rate(mapping: Mapping, case: DataCase | None, rate: float | None) -> float:
 
 
 def _check_dense(
-    log: Log, parts: Sequence[Piece], rate: float, densest: Signal, budget: Budget, width: int
+    log: Log,
+    parts: Sequence[Piece],
+    rate: float,
+    densest: Signal,
+    budget: Budget,
+    width: int,
+    *,
+    sparse: float = 100.0,
 ) -> None:
-    """Refuse times in another unit, and times between which there are many more samples."""
+    """Refuse times in another unit, and times between which there are many more samples.
+
+    Parameters
+    ----------
+    sparse : float, default 100.0
+        Samples per value of a log from which its times, or the sample rate, are wrong.
+
+    """
     samples = sum(each.stop - each.start for each in parts) * rate
     values, span = len(densest.times), samples / rate
     remedy = 'check rate, and column and unit of [time], in the mapping; by = "gap" in [cut] '
     remedy += "leaves out pauses"
-    got, wrong = f"{values} values in {span:g} s", samples > SPARSE * max(values, 2)
+    got, wrong = f"{values} values in {span:g} s", samples > sparse * max(values, 2)
     unit = misread_unit(span / max(values - 1, 1), 1 / rate) if wrong or samples < 1 else ""
     if unit:
         got += f", as if times in {unit} were read as s"

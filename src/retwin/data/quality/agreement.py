@@ -24,8 +24,6 @@ FASTER = 3.0
 identified have up to 1.5 by chance."""
 POWERS = 0.05, 0.25
 """Decades from one power of ten, and from a higher one, within which a unit is named."""
-MOVED = 0.1
-"""Share of the largest motion of an output below which it counts as that much."""
 OTHER, UNLIKE = GENERAL = ("other commands", "unlike the others")
 """What is wrong with a record of which nothing else is known."""
 
@@ -170,13 +168,20 @@ def _time_base(records: Trajectories, y: NDArray, ideal: NDArray) -> Iterator[Fi
 
 
 def _unlike(
-    records: Trajectories, names: list[str], y: NDArray, ideal: NDArray
+    records: Trajectories, names: list[str], y: NDArray, ideal: NDArray, *, moved: float = 0.1
 ) -> Iterator[Finding]:
-    """Outputs that their nominal ones explain in most healthy records, and not in one."""
+    """Outputs that their nominal ones explain in most healthy records, and not in one.
+
+    Parameters
+    ----------
+    moved : float, default 0.1
+        Share of the largest motion of an output below which it counts as that much.
+
+    """
     residual = np.nanmean((y - ideal) ** 2, axis=1)
-    motion = np.maximum(np.nanvar(y, axis=1), MOVED**2 * np.nanvar(ideal, axis=1).max(axis=0))
+    motion = np.maximum(np.nanvar(y, axis=1), moved**2 * np.nanvar(ideal, axis=1).max(axis=0))
     share = np.sum(_unit_length(y, 1) * _unit_length(ideal, 1), axis=1)
-    moving = np.nanvar(ideal, axis=1) > MOVED**2 * np.nanvar(ideal, axis=1).max(axis=0)
+    moving = np.nanvar(ideal, axis=1) > moved**2 * np.nanvar(ideal, axis=1).max(axis=0)
     unlike = (np.where(moving, 1 - share, 0.0), 1 - CLEAR**0.5), (residual, (1 - CLEAR) * motion)
     for k, name in enumerate(names):
         own = np.flatnonzero(np.isfinite(residual[:, k]))

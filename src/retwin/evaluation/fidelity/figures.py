@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,6 @@ from retwin.serialisation.files import write_atomically
 
 BINS = 100
 """Bins of the PIT histograms, which are stored; pages show fewer."""
-SHOWN_BINS = 20
-"""Bins of a PIT histogram on a page, of which each joins several of the computed ones."""
-MIN_TRAJECTORIES = 8
-"""Least number of trajectories for the classifier two-sample test: fewer do not train it."""
-MAX_PLACES = 512
-"""Largest number of values at which two distributions are compared, which bounds the memory."""
 _KEYS = {
     **{name: name for name in ("ids", "nominal", "observed", "seen", "bands", "crps", "energy")},
     **{name: name for name in ("pit", "features", "widening", "at_bound")},
@@ -225,24 +219,23 @@ class Fidelity:
             "rivals": list(self.rivals),
             "widening": float(self.widening.mean()) if np.isfinite(self.widening).all() else None,
             "at_bound": float(self.at_bound.mean()) if np.isfinite(self.at_bound).all() else None,
-            "figures": {
-                name: {
-                    "value": each.value,
-                    "interval": None if each.interval is None else list(each.interval),
-                    "p": each.p,
-                }
-                for name, each in self.figures.items()
-            },
+            "figures": {name: asdict(each) for name, each in self.figures.items()},
         }
 
-    def pit_shares(self) -> NDArray:
-        """PIT histogram (3, `SHOWN_BINS`) over all outputs.
+    def pit_shares(self, *, shown_bins: int = 20) -> NDArray:
+        """PIT histogram (3, `shown_bins`) over all outputs.
 
         That of the measured trajectories, and its 5 and 95 % quantiles for a perfect generator on
         as many trajectories.
+
+        Parameters
+        ----------
+        shown_bins : int, default 20
+            Bins of a PIT histogram on a page, of which each joins several of the computed ones.
+
         """
         pooled = self.pit.mean(axis=(0, 2))
-        shares = pooled.reshape(len(pooled), SHOWN_BINS, -1).sum(axis=2)
+        shares = pooled.reshape(len(pooled), shown_bins, -1).sum(axis=2)
         return np.stack([shares[0], *np.quantile(shares[1:], [0.05, 0.95], axis=0)])
 
     def _positive(self, values: NDArray) -> Figure:
@@ -292,12 +285,22 @@ class Fidelity:
             lambda w: np.abs(w @ cumulative[:, 0] - uniform).max(axis=1), p=share_as_far(each)
         )
 
-    def _per_segment(self, name: str, values: NDArray) -> dict[str, Figure]:
-        """KS distance of measured and drawn values (n, 1 + 19, M); for z coverage too."""
+    def _per_segment(
+        self, name: str, values: NDArray, *, max_places: int = 512
+    ) -> dict[str, Figure]:
+        """KS distance of measured and drawn values (n, 1 + 19, M); for z coverage too.
+
+        Parameters
+        ----------
+        max_places : int, default 512
+            Largest number of values at which two distributions are compared, which bounds the
+            memory.
+
+        """
         known = np.isfinite(values)
         if not (known[:, 0].any() and known[:, 1:].any()):
             return {}
-        below, count = cumulative_counts(values, MAX_PLACES)
+        below, count = cumulative_counts(values, max_places)
         equal = np.ones((1, len(self)))
         members = range(values.shape[1])
         each = np.array([ks_distance(below, count, equal, member)[0] for member in members])
@@ -316,9 +319,16 @@ class Fidelity:
         hit = ((low <= values[:, 0]) & (values[:, 0] <= high)).sum(axis=1)
         return _share(hit, np.isfinite(values[:, 0]).sum(axis=1))
 
-    def _classifier(self) -> dict[str, Figure]:
-        """AUROC of a forest that separates measured from drawn, cross-validated by trajectory."""
-        if len(self) < MIN_TRAJECTORIES:
+    def _classifier(self, *, min_trajectories: int = 8) -> dict[str, Figure]:
+        """AUROC of a forest that separates measured from drawn, cross-validated by trajectory.
+
+        Parameters
+        ----------
+        min_trajectories : int, default 8
+            Least number of trajectories for the classifier two-sample test: fewer do not train it.
+
+        """
+        if len(self) < min_trajectories:
             return {}
         from sklearn.ensemble import ExtraTreesClassifier
         from sklearn.model_selection import GroupKFold

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from retwin.checks import needs_extra, require
+from retwin.checks import at_most, needs_extra, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError, brief
 from retwin.serialisation.sizes import Budget
@@ -27,10 +27,6 @@ WHOLE = (
 SCALARS = (*NUMBERS, *WHOLE, "Boolean")
 HIDDEN = (("output", "local"), ("output", "calculatedParameter"))
 """Pairs of what a channel is and another causality that it may have if it is named."""
-UNLIMITED = 1e30
-"""Magnitude above which a declared limit counts as none: tools write the largest float for it."""
-MAX_SCALARS = 1_000_000
-"""Largest number of scalars that one array may hold, since a file of some bytes may declare any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +67,17 @@ class Scalar:
         return _limit(low, -np.inf), _limit(high, np.inf)
 
 
-def _limit(declared: Any, none: float) -> float:
-    """A declared limit as a number; `none` where it is none."""
+def _limit(declared: Any, none: float, *, unlimited: float = 1e30) -> float:
+    """A declared limit as a number; `none` where it is none.
+
+    Parameters
+    ----------
+    unlimited : float, default 1e+30
+        Magnitude above which a declared limit counts as none: tools write the largest float for it.
+
+    """
     value = none if declared is None else float(declared)
-    return value if abs(value) < UNLIMITED else none
+    return value if abs(value) < unlimited else none
 
 
 def _fmpy() -> Any:
@@ -233,18 +236,22 @@ def find_scalars(description: Any, argument: str, names: Sequence[str]) -> list[
     return chosen
 
 
-def _scalars(variable: Any, argument: str) -> Iterator[Scalar]:
-    """The elements of an array; of another variable itself."""
+def _scalars(variable: Any, argument: str, *, max_scalars: int = 1_000_000) -> Iterator[Scalar]:
+    """The elements of an array; of another variable itself.
+
+    Parameters
+    ----------
+    max_scalars : int, default 1_000_000
+        Largest number of scalars that one array may hold, since a file of some bytes may declare
+        any.
+
+    """
     if not variable.shape:
         yield Scalar(variable.name, variable)
         return
-    require(
-        prod(variable.shape) <= MAX_SCALARS,
-        argument,
-        expected=f"arrays of at most {MAX_SCALARS} numbers",
-        got=f"{variable.name!r} of shape {variable.shape}",
-        remedy="export the FMU with smaller arrays",
-    )
+    remedy = "export the FMU with smaller arrays"
+    count = prod(variable.shape)
+    at_most(argument, count, max_scalars, f"numbers in the array {variable.name!r}", remedy=remedy)
     for place, index in enumerate(np.ndindex(variable.shape)):
         yield Scalar(f"{variable.name}[{','.join(map(str, index))}]", variable, place)
 
