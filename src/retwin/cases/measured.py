@@ -30,7 +30,7 @@ def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -
     joined = _healthy(found, notes)
     _check_size(joined)
     if transient:
-        joined = _settled(joined, transient)
+        joined = _mask_transient(joined, transient)
     unseen = ~joined.mask.any(axis=(0, 1))
     if unseen.any():
         lacking = ", ".join(np.array(joined.outputs.names)[unseen])
@@ -90,7 +90,7 @@ def _constant(found: Trajectories) -> list[str]:
     ]
 
 
-def _settled(found: Trajectories, transient: float) -> Trajectories:
+def _mask_transient(found: Trajectories, transient: float) -> Trajectories:
     """The trajectories without their outputs in the first seconds."""
     mask = found.mask.copy()
     mask[:, : round(transient * found.rate)] = False

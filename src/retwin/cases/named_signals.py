@@ -70,12 +70,12 @@ def check_there(name: str, column: str, there: Iterable[str]) -> None:
         column in there,
         name,
         expected=f"a column {column!r}",
-        got=f"columns {_listed(there)}",
+        got=f"columns {_list(there)}",
         remedy="name the columns as the header of the file does",
     )
 
 
-def _listed(names: Iterable[str]) -> str:
+def _list(names: Iterable[str]) -> str:
     every = list(names)
     more = f", … ({len(every)} in all)" if len(every) > LISTED else ""
     return ", ".join(every[:LISTED]) + more
@@ -113,7 +113,7 @@ def check_named(log: Log, twin: Twin, named: Mapping[str, str], *, table: bool) 
         not lacking,
         log.name,
         expected=f"a {what} for every command, {', '.join(twin.inputs.names)}",
-        got=f"{all_of} {_listed(log.signals)}; none for {', '.join(lacking)}",
+        got=f"{all_of} {_list(log.signals)}; none for {', '.join(lacking)}",
         remedy=f"give --column {lacking[0]}=NAME, --inputs with the names of the inputs that "
         f"were recorded, {mapped}"
         if lacking
@@ -123,7 +123,7 @@ def check_named(log: Log, twin: Twin, named: Mapping[str, str], *, table: bool) 
         any(each in found for each in twin.outputs.names),
         log.name,
         expected=f"a {what} for an output of the twin, {', '.join(twin.outputs.names)}",
-        got=f"{all_of} {_listed(log.signals)}",
+        got=f"{all_of} {_list(log.signals)}",
         remedy=f"give --column {twin.outputs.names[0]}=NAME, {mapped}",
     )
 

@@ -72,7 +72,7 @@ def fetch(
         The downloaded file has another SHA-256; nothing of it is kept.
 
     """
-    known = _known(name, url, sha256)
+    known = _find_file(name, url, sha256)
     require(
         known.url.startswith(("http://", "https://")),
         "url",
@@ -124,7 +124,7 @@ def cache_folder() -> Path:
     return Path(pooch.os_cache("retwin"))
 
 
-def _known(name: str, url: str | None, sha256: str | None) -> PublicFile:
+def _find_file(name: str, url: str | None, sha256: str | None) -> PublicFile:
     """The entry of the catalog with the caller's changes, or an entry of the caller's own."""
     known = DOWNLOADS.get(name)
     if known is not None:

@@ -62,7 +62,7 @@ class Layout:
 
         Raises ValueError if it has more or less than the table.
         """
-        row = _trimmed(row, len(self.names))
+        row = _trim(row, len(self.names))
         if len(row) != len(self.names):
             raise ValueError(f"{len(row)} of {len(self.names)} cells")
         return row
@@ -192,7 +192,7 @@ def _by_titles(
             width = len(row) - (not plain[-1])
             columns = [(plain if each in plain else names).index(each) for each in wanted]
             below = next((k for k in range(at + 1, len(rows)) if rows[k]), at + 1)
-            units = _trimmed(rows[below], width) if below < len(rows) else ()
+            units = _trim(rows[below], width) if below < len(rows) else ()
             some = [units[each] for each in columns] if len(units) == width else []
             if any(map(str.strip, some)) and not _holds_numbers(some, separator != ","):
                 return separator, below + 1, row[:width], units
@@ -228,7 +228,7 @@ def _by_numbers(lines: Sequence[str], place: str) -> tuple[str, int, Row, Row]:
     return separator, first, head[-1] if head else [""] * width, ()
 
 
-def _trimmed(row: Row, width: int) -> Row:
+def _trim(row: Row, width: int) -> Row:
     return row[:-1] if len(row) == width + 1 and not row[-1].strip() else row
 
 
@@ -245,9 +245,7 @@ def _head(rows: Sequence[Row], width: int, place: str) -> Sequence[Row]:
 
     Raises InputError for one that seems to hold damaged numbers, which would be left out.
     """
-    full = [
-        (number, row) for number, row in enumerate(rows, 1) if len(_trimmed(row, width)) == width
-    ]
+    full = [(number, row) for number, row in enumerate(rows, 1) if len(_trim(row, width)) == width]
     for number, row in full[1:]:
         filled = [cell.strip() for cell in row if cell.strip()]
         require(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.adaptive_grid import Integral, integrated
+from retwin.diagnosis.adaptive_grid import Integral, integrate
 from retwin.twins.faults.actuator_faults import ends_of
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
@@ -106,7 +106,7 @@ class FaultEvidence:
             possible = (end >= first) | (limits[2, 0] == limits[2, 1])
             return np.where(possible, own + self._under(fault, points), -np.inf)
 
-        found = integrated(log_likelihood, limits, np.array([False, True, True]), coverage)
+        found = integrate(log_likelihood, limits, np.array([False, True, True]), coverage)
         missing = np.array(
             [not isinstance(fault, SizedFault), False, fault.end is None], dtype=bool
         )
@@ -203,11 +203,11 @@ class FaultEvidence:
             case SensorFreeze(output=place):
                 seen = np.tile(record.seen, (len(points), 1, 1))
                 pairs = zip(active, seen, strict=True)
-                gain = [self._frozen(place, own, each) for own, each in pairs]
+                gain = [self._density_frozen(place, own, each) for own, each in pairs]
                 return Variants(seen=seen), np.array(gain)
         return Variants(), none
 
-    def _frozen(self, output: int, active: NDArray, seen: NDArray) -> float:
+    def _density_frozen(self, output: int, active: NDArray, seen: NDArray) -> float:
         """Log density of a frozen sensor's samples, which are removed from those `seen` (T, d_y).
 
         It repeats the sample of the onset, with a noise that cannot be smaller than what the steps

@@ -169,11 +169,11 @@ def _fit(
     seen: list[bool] = np.any(healthy.mask, axis=(0, 1)).tolist()
     outputs = tuple(compress(healthy.outputs.names, seen))
     limits = (1.0, min(errors, 1 + errors / len(healthy)), errors)
-    each, near, far = _explained(residual, noise, (context, observed, mask), limits)
-    simulated = _simulated(surrogate, residual, healthy, noise, round(1 / false_rate) - 1)
+    each, near, far = _explain(residual, noise, (context, observed, mask), limits)
+    simulated = _simulate(surrogate, residual, healthy, noise, round(1 / false_rate) - 1)
     others = DiagnosisInputs.of(surrogate, residual, simulated).with_error(variance)[:]
     bound = min(max(lower_bound(each, false_rate), float(far.mean())), float(near.mean()))
-    below = _explained(residual, noise, others)[0] < bound
+    below = _explain(residual, noise, others)[0] < bound
     return InversionDiagnoser(
         surrogate,
         residual,
@@ -185,7 +185,7 @@ def _fit(
     )
 
 
-def _explained(
+def _explain(
     residual: ResidualModel,
     noise: Noise,
     given: tuple[Context, Tensor, Tensor],
@@ -201,7 +201,7 @@ def _explained(
     return [((known.evidence + lost[0] - each) / samples).numpy() for each in lost]
 
 
-def _simulated(
+def _simulate(
     surrogate: Surrogate, residual: ResidualModel, healthy: Trajectories, noise: Noise, count: int
 ) -> Trajectories:
     """So many healthy trajectories of the corrected twin, with noise, measured as these were."""

@@ -104,11 +104,11 @@ class Rocket:
         before = Standardise(features.width)
         learnt = before.fit(features(fitted_on))(features(fitted_on))
         transform = _minirocket(self.kernels, task.seed, _channels(learnt))
-        convolved = _convolved(transform, learnt)
+        convolved = _convolve(transform, learnt)
         if progress is not None:
             progress(0.4)
         slope, level = _ridge(convolved, fitted_on.labels, order)
-        scores = _convolved(transform, before(features(held_out))) @ slope.T + level
+        scores = _convolve(transform, before(features(held_out))) @ slope.T + level
         truth = class_index(held_out, order).numpy()
         temperature, log_loss = _temperature(scores, truth)
         weights = {
@@ -174,7 +174,7 @@ class RocketDiagnoser:
             got=f"{standard.shape[1]} samples",
             remedy="cut or pad them to that length",
         )
-        convolved = _convolved(self._transform, standard)
+        convolved = _convolve(self._transform, standard)
         slope, level = (self.weights[name].double().numpy() for name in ("slope", "level"))
         found: NDArray = softmax(convolved @ slope.T + level, axis=1)
         # The comparison of a convolution with a bias is finite even where a channel is not.
@@ -248,7 +248,7 @@ def _channels(standard: Tensor) -> NDArray:
     return torch.cat([standard, sums], dim=2).transpose(1, 2).contiguous().numpy()
 
 
-def _convolved(transform: Any, standard: Tensor) -> NDArray:
+def _convolve(transform: Any, standard: Tensor) -> NDArray:
     """The share of samples (n, kernels) at which each convolution is above its bias."""
     # When numba starts its threads, it raises the number of torch's to that of the cores.
     with threadpool_limits(limits=1):

@@ -236,7 +236,7 @@ def _move(part: Path, target: Path, *, replace: bool) -> None:
         shutil.rmtree(former, ignore_errors=True)
     others = {each.name for each in target.iterdir()} - {each.name for each in part.iterdir()}
     refuse_others(target, others)
-    if _exchanged(part, target):
+    if _exchange(part, target):
         return
     # A kill between the two steps leaves no folder of that name: `recover` puts the former back.
     former = part.with_name(f"{part.name}{FORMER}")
@@ -249,7 +249,7 @@ def _move(part: Path, target: Path, *, replace: bool) -> None:
     shutil.rmtree(former)
 
 
-def _exchanged(part: Path, target: Path) -> bool:
+def _exchange(part: Path, target: Path) -> bool:
     """Exchange the names of two folders in one step; False where the file system cannot."""
     if os.name != "posix":
         return False
@@ -303,11 +303,11 @@ def _left_in(folder: Path) -> Iterator[Path]:
     """The temporary files and folders in `folder` whose process has ended."""
     for file in list(folder.iterdir()):
         found = TEMPORARY.fullmatch(file.name)
-        if found and _ended(int(found["process"]), found["token"]):
+        if found and _has_ended(int(found["process"]), found["token"]):
             yield file
 
 
-def _ended(process: int, token: str) -> bool:
+def _has_ended(process: int, token: str) -> bool:
     """Whether this machine has no such process; False where that cannot be tested."""
     if os.name != "posix":  # elsewhere signal 0 does not test whether a process exists
         return False

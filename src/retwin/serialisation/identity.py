@@ -30,11 +30,11 @@ def identity(value: object, *, max_depth: int = 12) -> str:
         Levels of nested objects; of deeper ones only the class counts, which ends cycles.
 
     """
-    text = json.dumps(_described(value, max_depth), sort_keys=True)
+    text = json.dumps(_describe(value, max_depth), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _described(value: Any, depth: int) -> Any:
+def _describe(value: Any, depth: int) -> Any:
     """`value` as JSON."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -49,13 +49,13 @@ def _described(value: Any, depth: int) -> Any:
     if depth == 0:
         return _kind(value)
     if isinstance(value, Mapping):
-        return [[str(key), _described(each, depth - 1)] for key, each in value.items()]
+        return [[str(key), _describe(each, depth - 1)] for key, each in value.items()]
     if isinstance(value, list | tuple):
-        return [_described(each, depth - 1) for each in value]
+        return [_describe(each, depth - 1) for each in value]
     if hasattr(value, "__qualname__") and not isinstance(value, MethodType):  # function or class
         return f"{value.__module__}:{value.__qualname__}"
-    fingerprint = _described(getattr(value, "fingerprint", ""), 0)
-    return [_kind(value), _described(_contents(value), depth - 1), fingerprint]
+    fingerprint = _describe(getattr(value, "fingerprint", ""), 0)
+    return [_kind(value), _describe(_contents(value), depth - 1), fingerprint]
 
 
 def _contents(value: Any) -> Any:

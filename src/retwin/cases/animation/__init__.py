@@ -101,7 +101,7 @@ def animate(
     body = given(
         "case", case.body, "a case with a body, which can be drawn", got=got, remedy=remedy
     )
-    one = _chosen(trajectories, case, index)
+    one = _choose(trajectories, case, index)
     one = case.complete(one)
     shots, chart = _shots(one, body, fps), None
     if updated is not None:
@@ -170,7 +170,7 @@ def _check(fps: float, size: tuple[int, int], renderer: str, *, least: tuple[int
     one_of("renderer", renderer, get_args(Renderer), remedy="leave it out to have one chosen")
 
 
-def _chosen(trajectories: Trajectories, case: Case, index: int | str) -> Trajectories:
+def _choose(trajectories: Trajectories, case: Case, index: int | str) -> Trajectories:
     """The one trajectory at `index`."""
     remedy = "give the case that the data belong to"
     agree(

@@ -156,7 +156,7 @@ class _Scene:
 
         self._mujoco = mujoco
         try:
-            self._model = _compiled(stage)
+            self._model = _compile(stage)
             self._addresses = [self._model.joint(name).qposadr[0] for name in stage.joints]
         except (ValueError, KeyError) as error:
             raise InputError(
@@ -208,7 +208,7 @@ class _Scene:
         return self._renderer.render()
 
 
-def _compiled(stage: _Stage) -> Any:
+def _compile(stage: _Stage) -> Any:
     """The model on light paper."""
     import mujoco
 

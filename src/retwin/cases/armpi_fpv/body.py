@@ -81,7 +81,7 @@ class ArmBody:
                 remedy="load the file with the arm's case, which completes commands",
             )
         nominal = self.twin.angles(trajectories.commands.astype(float))
-        return nominal, nearest_poses(self.twin.arm, nominal, _interpolated(trajectories))
+        return nominal, nearest_poses(self.twin.arm, nominal, _interpolate(trajectories))
 
     def skeleton(self, joints: NDArray) -> NDArray:
         """Ground, shoulder, elbow, wrist and end-effector.
@@ -172,7 +172,7 @@ def _descend(
     return gauss_newton(evaluate, start, rounds=gauss_newton_steps)
 
 
-def _interpolated(trajectories: Trajectories) -> NDArray:
+def _interpolate(trajectories: Trajectories) -> NDArray:
     """The measured path (n, T, 3), interpolated; nominal where a channel was never measured."""
     path = trajectories.observed.astype(float)
     time = np.arange(trajectories.steps)

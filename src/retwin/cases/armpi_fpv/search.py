@@ -244,7 +244,7 @@ def _search(
     ends = postures(which, nth[which, rank])
     free = np.array([False, True])
     for rounds, some, kept in ((4, coarse, starts * effort), (8, half, KEPT_GUESSES * effort)):
-        ends, costs, _ = _fitted(
+        ends, costs, _ = _fit_postures(
             plane, ends, part[which][:, :, some], data[which][:, :, some], free, rounds
         )
         order = np.lexsort((costs[:, 0], guess[which]))
@@ -308,7 +308,7 @@ def _costs(error: NDArray) -> NDArray:
     return (error**2).sum(axis=3).mean(axis=2)
 
 
-def _fitted(
+def _fit_postures(
     plane: Plane, postures: NDArray, part: NDArray, data: NDArray, free: NDArray, rounds: int
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Postures (p, m + 1, 3) where they are free, fitted together; their costs and Jacobian."""
@@ -344,7 +344,9 @@ def _refine(plane: Plane, guesses: Explanations, on_grid: NDArray, moves: int, r
     part, data = _movements(plane, path, first, guesses.lengths[:, :moves])
     free = np.ones((path.size, moves + 1), dtype=bool)
     free[:, 0] = ~on_grid[path]
-    ends, cost, slope = _fitted(plane, guesses.postures[:, : moves + 1], part, data, free, rounds)
+    ends, cost, slope = _fit_postures(
+        plane, guesses.postures[:, : moves + 1], part, data, free, rounds
+    )
     guesses.postures[:, : moves + 1], guesses.cost[:, :moves] = ends, cost
     matrix = slope.swapaxes(1, 2) @ slope + 1e-16 * np.eye(slope.shape[2])
     variance = np.abs(np.einsum("nii->ni", np.linalg.inv(matrix))).reshape(ends.shape)

@@ -105,7 +105,7 @@ def read_zarr(
         copy, the memory has none for a chunk, or the package zarr is not installed.
 
     """
-    with _opened(path) as (group, header):
+    with _open(path) as (group, header):
         budget = Budget(path.name, max_bytes, disk=tempfile.gettempdir())
         if header["schema"] == CHUNKED:
             return _read_chunks(group, header, path.name, rows, budget)
@@ -114,7 +114,7 @@ def read_zarr(
             shape = header["arrays"][name]["shape"]
             _check_size(group[name], shape, TRAJECTORIES_PER_CHUNK, path.name)
             budget.take(group[name].nbytes)
-            arrays[name] = _copied(group[name])
+            arrays[name] = _copy(group[name])
         return restore(header, arrays, path.name)[rows]
 
 
@@ -127,12 +127,12 @@ def read_header(path: Path) -> dict[str, Any]:
         See `read_zarr`.
 
     """
-    with _opened(path) as (_, header):
+    with _open(path) as (_, header):
         return header
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
+def _open(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
     """The group in a folder, and its header; InputError for every exception in the block."""
     zarr, about = _zarr(), "zarr.json"
     expected = "a readable Zarr folder of trajectories"
@@ -198,7 +198,7 @@ def seal_chunked(path: Path, header: Mapping[str, Any]) -> None:
     _zarr().open_group(str(path), mode="r+").attrs[KEY] = dict(header)
 
 
-def _copied(stored: Any) -> NDArray:
+def _copy(stored: Any) -> NDArray:
     """An array of Zarr as a memory map; one chunk at a time is in memory."""
     if not stored.size:
         return np.empty(stored.shape, stored.dtype)

@@ -15,7 +15,7 @@ from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Log, Signa
 from retwin.data.logs.units import converted, same_unit
 from retwin.data.measured import stand_in
 from retwin.data.provenance import Sampling
-from retwin.data.resampling import Resampling, longest_bridge, resampled
+from retwin.data.resampling import Resampling, longest_bridge, resample
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 
@@ -51,10 +51,10 @@ class Channel:
     longest: float
     notes: tuple[str, ...]
 
-    def sampled(self, grid: NDArray, period: float, end: float) -> NDArray:
+    def resample(self, grid: NDArray, period: float, end: float) -> NDArray:
         """Its values (N,) on a grid of times, NaN where they are missing."""
         last = end if self.how == "hold" else None
-        return resampled(
+        return resample(
             self.signal.times,
             self.signal.values,
             grid,

@@ -84,7 +84,7 @@ def mapped(
 
     """
     found = parts_of(log, mapping, budget=budget, case=case, rate=rate)
-    return _finished(log, found.raws(log, mapping.label), found, case, budget)
+    return _finish(log, found.raws(log, mapping.label), found, case, budget)
 
 
 def parts_of(
@@ -124,7 +124,7 @@ def parts_of(
     return found
 
 
-def tried(log: Log, mapping: Mapping | None, *, case: DataCase | None = None) -> Parts | str:
+def try_mapping(log: Log, mapping: Mapping | None, *, case: DataCase | None = None) -> Parts | str:
     """The parts of a log that a proposed mapping makes trajectories, or why there are none.
 
     Parameters
@@ -181,7 +181,7 @@ class Parts:
         spread = (piece.stop - piece.start) * self.rate
         count = max(0, round(spread)) if piece.open_end else int(spread + SAME) + 1
         grid = piece.start + np.arange(count) / self.rate
-        columns = [each.sampled(grid, 1 / self.rate, self.end) for each in self.every]
+        columns = [each.resample(grid, 1 / self.rate, self.end) for each in self.every]
         block = np.stack(columns, axis=1) if count else np.empty((0, len(columns)))
         known = np.isfinite(block)
         needed = known[:, : self.needed]
@@ -257,7 +257,7 @@ class Parts:
         return [f"{', '.join(own)}: {note}" for note, own in channels.items()]
 
 
-def _finished(
+def _finish(
     log: Log,
     raws: Sequence[Raw],
     found: Parts,

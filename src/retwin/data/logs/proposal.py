@@ -131,14 +131,14 @@ def propose_mapping(
             if mapping is not None and not proposal.open_channels
             else [each.name for each in proposal.facts if _moves(each)]
         )
-        other = _stamped(path, proposal, names, stamped, Budget(path.name, limit))
+        other = _read_stamped(path, proposal, names, stamped, Budget(path.name, limit))
         if other is not None:
             made = proposed(log, stamped, case=case, delay=other[1])
             proposal = replace(made, log=other[0])
     return proposal
 
 
-def _stamped(
+def _read_stamped(
     path: Path,
     proposal: Proposal,
     names: Collection[str],

@@ -71,8 +71,8 @@ def find_disagreements(records: Trajectories) -> Iterator[Finding]:
         return
     own = records[healthy]
     y, ideal = y[healthy], ideal[healthy]
-    yield from _permuted(own, _squared(y, ideal))
-    yield from _exchanged(own, names, y, ideal)
+    yield from _find_permutations(own, _square(y, ideal))
+    yield from _find_exchange(own, names, y, ideal)
     yield from _units(names, y, ideal)
     yield from _time_base(own, y, ideal)
     yield from _unlike(own, names, y, ideal)
@@ -86,7 +86,7 @@ def _unit_length(values: NDArray, axis: tuple[int, ...] | int) -> NDArray:
     return np.divide(centred, length, out=np.zeros_like(centred), where=length > 0)
 
 
-def _squared(y: NDArray, ideal: NDArray) -> NDArray:
+def _square(y: NDArray, ideal: NDArray) -> NDArray:
     """Squared correlation (n, n) of the outputs of each record with the nominal ones of each.
 
     It is the mean over outputs, by the motion of each nominal one.
@@ -100,7 +100,7 @@ def _squared(y: NDArray, ideal: NDArray) -> NDArray:
     return np.asarray((found * weight).sum(axis=2) / total)
 
 
-def _permuted(records: Trajectories, squared: NDArray) -> Iterator[Finding]:
+def _find_permutations(records: Trajectories, squared: NDArray) -> Iterator[Finding]:
     """Records that fit the commands of another one, and not their own."""
     own, best = np.diag(squared), squared.argmax(axis=1)
     for i, j in enumerate(best.tolist()):
@@ -111,7 +111,7 @@ def _permuted(records: Trajectories, squared: NDArray) -> Iterator[Finding]:
             yield Finding(str(records.ids[i]), "", OTHER, text)
 
 
-def _exchanged(
+def _find_exchange(
     records: Trajectories, names: list[str], y: NDArray, ideal: NDArray
 ) -> Iterator[Finding]:
     """Pairs of outputs that fit each other's nominal outputs, in all records or in one."""

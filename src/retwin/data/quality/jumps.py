@@ -43,7 +43,7 @@ def find_jumps(every: Sequence[Readings], *, rare: float = 0.1) -> Iterator[Find
     found = np.concatenate([*taken, _take_far(jumps, steps, FAR, together=False)])
     if np.sum(found[:, END] - found[:, START]) <= rare * sum(map(len, steps)):
         for place in np.unique(found[:, PLACE]):
-            yield _described(every[int(place)], found[found[:, PLACE] == place])
+            yield _describe(every[int(place)], found[found[:, PLACE] == place])
 
 
 PLACE, START, END, SIZE, VALUE = range(5)
@@ -103,7 +103,7 @@ def _take_far(jumps: NDArray, steps: list[NDArray], factor: float, *, together: 
     return jumps[:count]
 
 
-def _described(each: Readings, jumps: NDArray) -> Finding:
+def _describe(each: Readings, jumps: NDArray) -> Finding:
     """A finding for the jumps of one record."""
     largest = jumps[np.argmax(jumps[:, SIZE]), VALUE]
     count = int(np.sum(jumps[:, END] - jumps[:, START]))

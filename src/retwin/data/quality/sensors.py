@@ -48,10 +48,10 @@ def find_stretches(every: Sequence[Readings]) -> Iterator[Finding]:
         usual = float(np.quantile(others, 0.25)) if len(others) else 0.0
         for level in _unusual(each, usual, noisy=noisy):
             start, end, count = each.span_of(level)
-            yield each.finding(*_named(each, level, start, end, count), start, end)
+            yield each.finding(*_name(each, level, start, end, count), start, end)
 
 
-def _named(each: Readings, level: float, start: int, end: int, count: int) -> tuple[str, str]:
+def _name(each: Readings, level: float, start: int, end: int, count: int) -> tuple[str, str]:
     """What a level is, and in words."""
     why = "while its twin moves" if each.ideal else "while the commands change"
     if end - start == each.size and count == 1:

@@ -182,7 +182,7 @@ def next_experiments(
     least = 1 if isinstance(twin, DynamicsTwin) else MIN_TRAJECTORIES
     at_least("calibration", healthy, least, "healthy trajectories", remedy=remedy)
     references = sampler.sample(REFERENCES, rng=rng)
-    known, curve = _known(twin, healthy, references, rng)
+    known, curve = _learn(twin, healthy, references, rng)
     show(0.6)
     now = known.knowledge(references)
     drawn = sampler.sample(candidates, rng=rng)
@@ -294,7 +294,7 @@ def _recall(excess: float, *, fault: float = 3.0) -> float:
     return float(norm.cdf(size - BAND) + norm.cdf(-size - BAND))
 
 
-def _known(
+def _learn(
     twin: CorrectedTwin | DynamicsTwin,
     healthy: Trajectories,
     references: NDArray,

@@ -144,14 +144,14 @@ class SegmentKnowledge:
         mean[..., self.used] = (self.design(context) @ self.coefficients.mT).float()
         every = _stride(correction, context.rate)
         times = torch.arange(0, context.commands.shape[1], every)
-        base = _applied(correction, context, mean, times)
+        base = _apply(correction, context, mean, times)
         slopes = []
         for index, deviation in zip(
             self.used.tolist(), self.scatter.diagonal().sqrt().tolist(), strict=True
         ):
             moved = mean.clone()
             moved[..., index] += STEP * deviation
-            change = _applied(correction, context, moved, times) - base
+            change = _apply(correction, context, moved, times) - base
             slopes.append(change.double() / (STEP * deviation))
         slope = torch.stack(slopes, dim=-1)  # (n, S, d_y, k)
         products = torch.einsum("ntyi,ntyj->ntij", slope, slope)
@@ -163,7 +163,7 @@ class SegmentKnowledge:
         return torch.einsum("nmt,ntij->nmij", inside, products) / self.noise**2
 
 
-def _applied(correction: Correction, context: Context, z: Tensor, times: Tensor) -> Tensor:
+def _apply(correction: Correction, context: Context, z: Tensor, times: Tensor) -> Tensor:
     """Corrected outputs (n, S, d_y) at some samples."""
     operator = before_sensor(correction)
     at = getattr(operator, "at", None)

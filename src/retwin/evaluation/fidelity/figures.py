@@ -135,7 +135,7 @@ class Fidelity:
         """Several sets of trajectories as one, each compared with a twin of its own."""
         segments = max(part.segment_values.shape[2] for part in parts)
         padded = [
-            replace(part, segment_values=_padded(part.segment_values, segments)) for part in parts
+            replace(part, segment_values=_pad(part.segment_values, segments)) for part in parts
         ]
         arrays: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in padded]) for name in _KEYS
@@ -194,7 +194,7 @@ class Fidelity:
         for c, name in enumerate(self.outputs.names):
             found[f"crps/{name}"] = self._positive(self.crps[:, c])
         for name, (crps, energy) in self.rivals.items():
-            found |= self._compared(name, crps, energy)
+            found |= self._compare(name, crps, energy)
         for level in (50, 90):
             found[f"coverage{level}"] = _share(self.inside(level).mean(axis=1))
         if np.isfinite(self.widening).all():
@@ -251,7 +251,7 @@ class Fidelity:
         interval = None if ends is None else (max(ends[0], 0.0), min(ends[1], 1.0))
         return Figure(value, interval, p)
 
-    def _compared(self, name: str, crps: NDArray, energy: NDArray) -> dict[str, Figure]:
+    def _compare(self, name: str, crps: NDArray, energy: NDArray) -> dict[str, Figure]:
         """Scores of another twin, and the paired relative differences of this one's from them."""
         found = {f"energy/{name}": self._positive(energy)}
         for c, output in enumerate(self.outputs.names):
@@ -353,6 +353,6 @@ def _share(hits: NDArray, counts: NDArray | None = None) -> Figure:
     return Figure(float(hits.sum() / trials.sum()), grouped_share_interval(hits, trials))
 
 
-def _padded(values: NDArray, segments: int) -> NDArray:
+def _pad(values: NDArray, segments: int) -> NDArray:
     missing = segments - values.shape[2]
     return np.pad(values, ((0, 0), (0, 0), (0, missing), (0, 0)), constant_values=np.nan)

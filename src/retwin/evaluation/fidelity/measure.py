@@ -89,7 +89,7 @@ def measure_fidelity(
         than 19 draws.
 
     """
-    stride = _checked(twin, trajectories, rate, draws)
+    stride = _check(twin, trajectories, rate, draws)
     if against is None:
         against = {}
         if isinstance(twin, CorrectedTwin):
@@ -171,7 +171,7 @@ def measure_widening(
     models", JASA 118 (2023): the method that pools the distributions of the groups.
 
     """
-    stride = _checked(twin, trajectories, rate, draws)
+    stride = _check(twin, trajectories, rate, draws)
     seeds = np.random.SeedSequence(seed).generate_state(len(trajectories)).tolist()
     ratios = []
     for i, twin_seed in enumerate(seeds):
@@ -185,7 +185,7 @@ def measure_widening(
     return max(1.0, further_group_quantile(ratios, 0.9))
 
 
-def _checked(twin: Twin, trajectories: Trajectories, rate: float | None, draws: int) -> int:
+def _check(twin: Twin, trajectories: Trajectories, rate: float | None, draws: int) -> int:
     """The stride of the comparison in samples; InputError for what cannot be compared."""
     stride = checked_stride(twin, trajectories, rate, "trajectories")
     require(

@@ -228,7 +228,7 @@ def validate_identification(
     simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]] = {}
     for part, measured in parts.items():
         checked_stride(before, measured, None, part)
-        simulated[part] = _simulated(before, mean, measured, used, horizon, seed)
+        simulated[part] = _simulate(before, mean, measured, used, horizon, seed)
     last = simulated["validation" if held_out is not None else "identification"]
     return Identification(
         twin=mean,
@@ -241,7 +241,7 @@ def validate_identification(
     )
 
 
-def _simulated(
+def _simulate(
     before: ParametricTwin,
     after: ParametricTwin,
     measured: Trajectories,

@@ -51,7 +51,7 @@ def sampler_from(
     """
     values = np.asarray(commands, np.float64)
     contained = CommandRange.of(values, rate)
-    low, high = _wider(contained, limits)
+    low, high = _widen(contained, limits)
     segments = Segments.from_commands(values)
     if moves_and_rests(segments):
         return _ramps(values, rate, segments, low, high)
@@ -82,7 +82,7 @@ def sampler_from(
     )
 
 
-def _wider(contained: CommandRange, limits: Limits | None) -> tuple[NDArray, NDArray]:
+def _widen(contained: CommandRange, limits: Limits | None) -> tuple[NDArray, NDArray]:
     """The range of the record (d_u,) with a margin, within the twin's limits."""
     low, high = np.array(contained.low), np.array(contained.high)
     size = np.maximum(np.abs(low), np.abs(high))

@@ -171,17 +171,17 @@ class Instance:
         if self.spent:
             raise Retired
         if self.reuse and self.sound and self._reset():
-            if self._restored(self._reset, 0.0):
+            if self._check_restored(self._reset, 0.0):
                 return
             self.reuse, self.forgets = False, True
         self._another()
-        if not self._restored(self._another, same):
+        if not self._check_restored(self._another, same):
             raise Retired(
                 "runs differ with what their process ran before, even in a new instance; every run "
                 "has a process of its own"
             )
 
-    def _restored(self, renew: Callable[[], bool], tolerance: float) -> bool:
+    def _check_restored(self, renew: Callable[[], bool], tolerance: float) -> bool:
         """Whether the first trajectory has the same outputs again, if that is to be checked."""
         if self.first is None or not self.unchecked:
             return True
