@@ -170,12 +170,12 @@ class PathFit:
         """Mean (n, M) of values (n, T) from just before a movement to just after it."""
         return _means(values, np.maximum(self.first - 1, 0), np.minimum(self.last + 3, self.length))
 
-    def _rests(self, *, rounding: float = 1.5e-06) -> tuple[NDArray, NDArray]:
+    def _rests(self, *, rounding: float = 1.5e-6) -> tuple[NDArray, NDArray]:
         """Mean radius and height (n, M + 1, 2) of the rests in m, and their tolerance (n,).
 
         Parameters
         ----------
-        rounding : float, default 1.5e-06
+        rounding : float, default 1.5e-6
             Error in m, above that of rounding the published paths to 1e-6 m per axis.
 
         """

@@ -13,13 +13,13 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Channels
+from retwin.evaluation.fidelity.stored import StoredArrays
 from retwin.scores.distributions import (
     central_band,
     cumulative_counts,
@@ -27,16 +27,9 @@ from retwin.scores.distributions import (
     share_as_far,
 )
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval
-from retwin.serialisation.files import write_atomically
 
 BINS = 100
 """Bins of the PIT histograms, which are stored; pages show fewer."""
-_KEYS = {
-    **{name: name for name in ("ids", "nominal", "observed", "seen", "bands", "crps", "energy")},
-    **{name: name for name in ("pit", "features", "widening", "at_bound")},
-    "segment_values": "movements",
-}
-"""Attributes with one row per trajectory, and their keys in NPZ files."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +55,7 @@ class Figure:
 
 
 @dataclass(frozen=True, eq=False)
-class Fidelity:
+class Fidelity(StoredArrays):
     """Scores of n trajectories at P samples of d outputs; `figures` sums them up.
 
     Attributes
@@ -138,45 +131,15 @@ class Fidelity:
             replace(part, segment_values=_pad(part.segment_values, segments)) for part in parts
         ]
         arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in padded]) for name in _KEYS
+            name: np.concatenate([getattr(part, name) for part in padded])
+            for name, value in vars(padded[0]).items()
+            if isinstance(value, np.ndarray)
         }
         rivals: dict[str, Any] = {
             name: tuple(map(np.concatenate, zip(*(p.rivals[name] for p in parts), strict=True)))
             for name in parts[0].rivals
         }
         return replace(parts[0], rivals=rivals, **arrays)
-
-    def save(self, file: str | Path) -> None:
-        """Write an NPZ file; `load` reads it."""
-        arrays = {key: getattr(self, name) for name, key in _KEYS.items()}
-        for name, (crps, energy) in self.rivals.items():
-            arrays |= {f"rival/{name}/crps": crps, f"rival/{name}/energy": energy}
-        for key, channels in (("outputs", self.outputs), ("movement", self.segment_channels)):
-            arrays[key] = np.array([channels.names, channels.units])
-        about = {"rate": np.array(self.rate), "draws": np.array(self.draws)}
-        with write_atomically(Path(file)) as part:
-            np.savez_compressed(part, allow_pickle=False, **arrays, **about)
-
-    @classmethod
-    def load(cls, file: str | Path) -> Fidelity:
-        """Read what `save` wrote."""
-        with np.load(file, allow_pickle=False) as found:
-            names = [key.split("/")[1] for key in found.files if key.endswith("/crps")]
-            outputs, segment_channels = (
-                Channels(*(tuple(row.tolist()) for row in found[name]))
-                for name in ("outputs", "movement")
-            )
-            return cls(
-                outputs=outputs,
-                segment_channels=segment_channels,
-                rate=float(found["rate"]),
-                draws=int(found["draws"]),
-                rivals={
-                    name: (found[f"rival/{name}/crps"], found[f"rival/{name}/energy"])
-                    for name in names
-                },
-                **{name: found[key] for name, key in _KEYS.items()},
-            )
 
     def inside(self, level: int, *, widened: bool = False) -> NDArray:
         """Share (n, d) of each trajectory's samples inside its central 50 or 90 % band."""

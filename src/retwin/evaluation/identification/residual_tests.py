@@ -63,13 +63,13 @@ class ResidualTest:
 
 
 def residual_tests(
-    residual: NDArray, measured: Trajectories, *, negligible: float = 1e-06
+    residual: NDArray, measured: Trajectories, *, negligible: float = 1e-6
 ) -> tuple[ResidualTest, ...]:
     """Tests of the residuals (n, T, d_y) of each output, NaN where nothing was measured.
 
     Parameters
     ----------
-    negligible : float, default 1e-06
+    negligible : float, default 1e-6
         RMS of a residual, over the standard deviation of the output, below which it is rounding.
 
     """

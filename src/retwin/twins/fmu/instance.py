@@ -154,12 +154,12 @@ class Instance:
         elif self.first and not self.moved and not np.array_equal(outputs, self.first[2]):
             self.moved = self.unchecked = True
 
-    def _renew(self, *, same: float = 1e-06) -> None:
+    def _renew(self, *, same: float = 1e-6) -> None:
         """Restore the initial state: by a reset, or by another instance or process.
 
         Parameters
         ----------
-        same : float, default 1e-06
+        same : float, default 1e-6
             Largest difference, relative to the largest output, between runs of one trajectory that
             count as equal in different instances, so that an FMU whose last digits vary needs no
             process per run.
@@ -309,7 +309,7 @@ class Instance:
         slave.exitInitializationMode()
         return begin
 
-    def _table(self, commands: NDArray, *, rounding: float = 1e-09) -> NDArray:
+    def _table(self, commands: NDArray, *, rounding: float = 1e-9) -> NDArray:
         """Inputs (K, d_u) at all communication points.
 
         Continuous inputs are linear between samples, others are held; an input with a rate of its
@@ -317,7 +317,7 @@ class Instance:
 
         Parameters
         ----------
-        rounding : float, default 1e-09
+        rounding : float, default 1e-9
             Times in samples that are this close below a whole number count as that number: they
             round.
 
