@@ -772,7 +772,7 @@ def test_write_atomically_puts_the_old_folder_back(tmp_path, monkeypatch):
     target.mkdir()
     (target / "a").write_text("old")
     real = os.replace
-    monkeypatch.setattr("retwin.serialisation.files._exchanged", lambda *_: False)
+    monkeypatch.setattr("retwin.serialisation.files._exchange", lambda *_: False)
 
     def failing(source, goal):
         if Path(goal) == target and not str(source).endswith(".former"):

@@ -12,9 +12,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from retwin.checks import at_most, needs_extra, require
+from retwin.checks import needs_extra, require
 from retwin.data.trajectories import Channels
-from retwin.errors import InputError, brief
+from retwin.errors import InputError
+from retwin.serialisation.files import refusing
 from retwin.serialisation.sizes import Budget
 from retwin.twins.limits import Limits
 
@@ -113,20 +114,13 @@ def read_description(path: Path) -> Any:
     if not path.is_file() or not zipfile.is_zipfile(path):
         got = "which is no zip file" if path.is_file() else "which is not there"
         raise refuse("an FMU, a zip file", got, "give the path of a .fmu file")
-    try:
+    expected = "an FMU with a readable modelDescription.xml"
+    with refusing(path.name, expected=expected, remedy="export it again"):
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
             Budget(path.name).take(archive.getinfo("modelDescription.xml").file_size)
         # Not validated against FMI's schema: many FMUs that run break it in some small way.
         description = fmpy.read_model_description(path, validate=False)
-    except InputError:
-        raise
-    except Exception as error:  # FMPy raises nothing more special
-        raise refuse(
-            "an FMU with a readable modelDescription.xml",
-            f"which has none ({brief(error)})",
-            "export it again",
-        ) from None
     if description.coSimulation is None or description.fmiMajorVersion == 1:
         raise refuse(
             "an FMU for co-simulation, FMI 2.0 or 3.0",
@@ -165,19 +159,11 @@ def extract(path: Path, folder: str) -> None:
         It cannot be unpacked, or the disk has no room for it.
 
     """
-    try:
+    expected, remedy = "an FMU that can be unpacked", "get or make the file again"
+    with refusing(path.name, expected=expected, remedy=remedy):
         with zipfile.ZipFile(path) as archive:
             Budget(path.name, disk=folder).take(sum(e.file_size for e in archive.infolist()))
         _fmpy().extract(path, folder)
-    except InputError:
-        raise
-    except Exception as error:  # FMPy raises nothing more special
-        raise InputError(
-            "path",
-            expected="an FMU that can be unpacked",
-            got=f"{path.name} ({brief(error)})",
-            remedy="get or make the file again",
-        ) from None
 
 
 def find_scalars(description: Any, argument: str, names: Sequence[str]) -> list[Scalar]:
@@ -249,9 +235,13 @@ def _scalars(variable: Any, argument: str, *, max_scalars: int = 1_000_000) -> I
     if not variable.shape:
         yield Scalar(variable.name, variable)
         return
-    remedy = "export the FMU with smaller arrays"
-    count = prod(variable.shape)
-    at_most(argument, count, max_scalars, f"numbers in the array {variable.name!r}", remedy=remedy)
+    require(
+        prod(variable.shape) <= max_scalars,
+        argument,
+        expected=f"arrays of at most {max_scalars} numbers",
+        got=f"{variable.name!r} of shape {variable.shape}",
+        remedy="export the FMU with smaller arrays",
+    )
     for place, index in enumerate(np.ndindex(variable.shape)):
         yield Scalar(f"{variable.name}[{','.join(map(str, index))}]", variable, place)
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import instance
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault
@@ -51,8 +51,14 @@ class RebuiltTwin(TwinWrapper):
 
         """
         made = self.build(dict(self.defaults))
-        remedy = "return a FunctionTwin, or any object that satisfies Twin"
-        return instance("build", made, Twin, remedy=remedy)  # type: ignore[type-abstract]
+        require(
+            isinstance(made, Twin),
+            "build",
+            expected="a function that returns a twin",
+            got=type(made).__name__,
+            remedy="return a FunctionTwin, or any object that satisfies Twin",
+        )
+        return made
 
     def simulate(
         self,
