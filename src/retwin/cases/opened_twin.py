@@ -190,7 +190,8 @@ def _choose_free(known: Sequence[Known], free: Sequence[str], name: str) -> list
     made = [_parameter(text, by_name, known) for text in free]
     names = [each.name for each in made]
     twice = sorted({each for each in names if names.count(each) > 1})
-    nothing("--free", twice, "each parameter once", remedy="give each a range once")
+    repeated = (f"{each} twice" for each in twice)
+    nothing("--free", repeated, "each parameter once", remedy="leave one of them out")
     return made
 
 
