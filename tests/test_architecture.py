@@ -211,6 +211,7 @@ def test_the_table_of_public_names_is_sorted_and_agrees_with_the_static_imports(
     assert homes == {**retwin._HOME, **dict.fromkeys(retwin._ROOMS, "")}
 
 
+@pytest.mark.slow
 def test_rooms_open_their_modules_when_used() -> None:
     code = (
         "import sys, retwin as rt\n"

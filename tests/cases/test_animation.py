@@ -97,6 +97,7 @@ def test_stick_figure(short: rt.Trajectories, case: rt.Case, tmp_path: Path) -> 
     assert sum(shown) == 1000 * FRAMES / FPS
 
 
+@pytest.mark.slow
 def test_same_trajectory_gives_same_bytes(
     short: rt.Trajectories, case: rt.Case, tmp_path: Path
 ) -> None:
@@ -131,6 +132,7 @@ class Offset:
         return rt.Trajectories(commands, nominal, nominal + drawn, self.rate)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(320, 240), (480, 240)])
 def test_an_updated_twin_is_in_the_film(
     short: rt.Trajectories, case: rt.Case, tmp_path: Path, size: tuple[int, int]
@@ -172,6 +174,7 @@ def test_mp4(short: rt.Trajectories, case: rt.Case, tmp_path: Path) -> None:
     reader.close()
 
 
+@pytest.mark.slow
 def test_mujoco_draws_or_says_what_is_missing(
     short: rt.Trajectories, case: rt.Case, tmp_path: Path
 ) -> None:
@@ -293,6 +296,7 @@ def test_case_that_cannot_be_drawn(short: rt.Trajectories, case: rt.Case, tmp_pa
         animate(other, case, tmp_path / "a.gif")
 
 
+@pytest.mark.slow
 def test_command_line(short: rt.Trajectories, tmp_path: Path) -> None:
     save(short, tmp_path / "set.npz")
     words = ["simulate", "armpi-kinematic", "--film", str(tmp_path / "arm.gif")]

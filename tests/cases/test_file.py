@@ -419,6 +419,7 @@ def test_a_model_and_an_fmu_lie_beside_the_file(
     assert (dict(case.twin.start), case.twin.substeps) == ({"gain": 3.0}, 2)
 
 
+@pytest.mark.slow
 def test_worker_processes_find_the_module(read: Callable[..., rt.Case], tmp_path: Path) -> None:
     case = read(BODY + "[commands]\nduration = 2\nsegments = 1\nramp_durations = [0.5]\n")
     plan = rt.deploy.SimulationPlan(case.twin, case.sampler, 0, 6, chunk=3)

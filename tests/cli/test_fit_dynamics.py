@@ -210,6 +210,7 @@ def test_states_that_the_twin_has_not_are_refused_when_the_case_is_read(folder: 
         rt.cases.get(str(file))
 
 
+@pytest.mark.slow
 def test_an_interrupt_of_the_yardstick_leaves_the_model(
     folder: Path, tmp_path: Path, call, monkeypatch: pytest.MonkeyPatch
 ) -> None:

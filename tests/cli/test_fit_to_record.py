@@ -87,6 +87,7 @@ def test_the_commands_of_a_case_are_like_those_of_its_record(folder: Path) -> No
     assert "of its power above 13 Hz" in missing
 
 
+@pytest.mark.slow
 def test_fit_adds_commands_that_the_sampler_lacks(folder: Path, call: Callable) -> None:
     real, out = folder / "real.npz", folder / "model"
     words = ("--real", real, "--simulations", 20, "--calibrate-on", "all", "--out", out)

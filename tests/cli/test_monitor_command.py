@@ -17,6 +17,7 @@ from retwin.twins import ParameterShift, SensorBias
 from retwin.update import DynamicsTwin
 
 
+@pytest.mark.slow
 def test_a_monitor_is_calibrated_and_its_promise_printed(watched: Path, call, tmp_path) -> None:
     given = (watched / "model", watched / "healthy.npz", "--false-alarms", "1 per day")
     out = tmp_path / "watch"
@@ -38,6 +39,7 @@ def test_an_alarm_without_a_cause_is_written_without_its_time() -> None:
     assert _written(Cause(alarm, "leaking", 0.7, 0.0, onset, onset, named)) == "leaking from 2 s"
 
 
+@pytest.mark.slow
 def test_a_leak_is_reported_with_its_time_and_cause(watched: Path, call) -> None:
     case, watch = ("--case", watched / "case.toml"), watched / "watch"
     code, printed, err = call("monitor", "replay", watch, watched / "leak.npz", *case, "--json")
@@ -56,6 +58,7 @@ def test_a_leak_is_reported_with_its_time_and_cause(watched: Path, call) -> None
     assert "(exact 95 % bound). Promised under the model: at most one in" in words
 
 
+@pytest.mark.slow
 def test_a_log_is_watched_by_its_columns_or_its_mapping(
     watched: Path, call, tmp_path: Path
 ) -> None:
@@ -79,6 +82,7 @@ def test_a_log_is_watched_by_its_columns_or_its_mapping(
         assert 300 <= found["alarms"][0]["time"] <= 315
 
 
+@pytest.mark.slow
 def test_tables_calibrate_without_a_model(call, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for name, steps, offset in (("healthy", 400, 0.0), ("later", 300, 8.0)):

@@ -96,6 +96,7 @@ def test_a_command_without_torch_starts_at_once(
     assert seconds < FACTOR * bare
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ["torch", "mujoco"])
 def test_a_missing_package_is_named_with_what_installs_it(package: str, folder: Path) -> None:
     code = f"import sys; sys.modules[{package!r}] = None{COMMAND}"

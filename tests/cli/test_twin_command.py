@@ -149,6 +149,7 @@ def test_a_mujoco_file(pendulum: Path) -> None:
     assert getattr(found, "limits", None) == rt.Limits((-1.0,), (1.0,), "clip")
 
 
+@pytest.mark.slow
 def test_a_module_in_the_current_folder(mine: str, tmp_path: Path) -> None:
     """By the command that is installed, which Python runs without the current folder."""
     command = [Path(sys.executable).with_name("retwin"), "twin", "simulate", f"{mine}:LIMITED"]
@@ -431,6 +432,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert rt.load(out / "a.zarr").commands.max() == 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("function", "match"),
     [

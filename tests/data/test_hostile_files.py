@@ -82,6 +82,7 @@ MATS: dict[str, Callable[[], bytes]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MATS)
 def test_mat_files_that_grow(tmp_path: Path, name: str) -> None:
     file = tmp_path / "a.mat"
@@ -227,6 +228,7 @@ def test_a_chunk_of_zarr_by_another_codec(tmp_path: Path) -> None:
     refused(folder, "packed by BytesCodec and ZstdCodec")
 
 
+@pytest.mark.slow
 def test_csv_files_that_are_too_large(tmp_path: Path) -> None:
     (tmp_path / "Healthy").mkdir()
     for name in ("1.csv", "2.csv"):

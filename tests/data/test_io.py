@@ -772,7 +772,7 @@ def test_write_atomically_puts_the_old_folder_back(tmp_path, monkeypatch):
     target.mkdir()
     (target / "a").write_text("old")
     real = os.replace
-    monkeypatch.setattr("retwin.serialisation.files._exchanged", lambda *_: False)
+    monkeypatch.setattr("retwin.serialisation.files._exchange", lambda *_: False)
 
     def failing(source, goal):
         if Path(goal) == target and not str(source).endswith(".former"):
@@ -911,6 +911,7 @@ def test_damaged_zarr_folders_are_refused_or_read(tmp_path, which, how):
         np.testing.assert_array_equal(getattr(read, name), getattr(example(), name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.mat", "b.mat", "c.npz"])
 def test_every_truncation_near_the_ends_is_refused(tmp_path, sound, name):
     file, data = tmp_path / name, sound[name]
@@ -1001,6 +1002,7 @@ CLASSES = {"Healthy"} | {
 }
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.real_data
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from retwin.data.logs.messages import Series, Types
 from retwin.data.logs.reading import read_log
 from retwin.data.logs.signals import Clock, Log, Signal, Skipped, named_unit
 from retwin.data.logs.units import compatible, converted, unit_in_name
-from retwin.data.resampling import resampled
+from retwin.data.resampling import resample
 from retwin.data.row_times import row_times
 from retwin.errors import InputError
 from retwin.report.figure import Line, envelope
@@ -264,7 +264,7 @@ def test_resampling_of_each_kind() -> None:
     grid = np.arange(0, 7) * 1.0
 
     def of(how, **more):
-        return resampled(at, values, grid, 1.0, how, longest=2.0, **more)
+        return resample(at, values, grid, 1.0, how, longest=2.0, **more)
 
     np.testing.assert_array_equal(of("linear"), [0, 2, *[np.nan] * 3, 8, np.nan])
     np.testing.assert_array_equal(of("hold", end=6.0), [0, 2, *[np.nan] * 3, 8, 8])

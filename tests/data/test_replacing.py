@@ -21,7 +21,7 @@ from retwin.serialisation import files
 
 target, step, exchange = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == "exchange"
 if not exchange:
-    files._exchanged = lambda *_: False
+    files._exchange = lambda *_: False
 steps = 0
 
 
@@ -37,7 +37,7 @@ def killed_before(function):
 
 
 for place, name in (
-    (os, "replace"), (files.shutil, "rmtree"), (files, "_exchanged"), (files, "_remove"),
+    (os, "replace"), (files.shutil, "rmtree"), (files, "_exchange"), (files, "_remove"),
 ):
     setattr(place, name, killed_before(getattr(place, name)))
 with files.write_atomically(target) as part:

@@ -34,6 +34,8 @@ from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.missed_segments import LatentPrior, fitted
 
+pytestmark = pytest.mark.slow
+
 CHAIN = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 MAP = np.array([[1.0, 0.5], [-0.3, 0.8], [0.2, -1.0]])
 SAMPLER = RampSampler((-1.0, -1.0), (1.0, 1.0), 100.0, 4.0, segments=4, ramp_durations=(0.3, 0.4))

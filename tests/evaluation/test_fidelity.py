@@ -69,6 +69,7 @@ def truth(real: rt.Trajectories) -> Fidelity:
     return measure_fidelity(Walk(), real, draws=DRAWS, seed=2, against=rivals)
 
 
+@pytest.mark.slow
 def test_the_truth_is_calibrated(truth: Fidelity) -> None:
     figures = truth.figures
     for level in (50, 90):
@@ -170,6 +171,7 @@ def test_outputs_of_different_units_are_standardised(real: rt.Trajectories) -> N
     np.testing.assert_allclose(found.energy, plain.energy / unit[0])
 
 
+@pytest.mark.slow
 def test_widening_is_one_for_the_truth_and_more_for_one_too_narrow() -> None:
     kept, others = measured(60, seed=7), measured(60, seed=8)
     assert 1 <= measure_widening(Walk(), kept, draws=200, seed=0) <= 1.15
@@ -252,6 +254,7 @@ def test_few_trajectories_have_no_interval(real: rt.Trajectories, count: int) ->
     assert np.isfinite([each.value for each in figures.values()]).all()
 
 
+@pytest.mark.slow
 def test_a_corrected_twin_against_its_own_draws(
     exact_updated: rt.CorrectedTwin, emulated: rt.Trajectories
 ) -> None:

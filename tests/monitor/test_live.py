@@ -117,6 +117,7 @@ def test_alarms_are_those_of_the_monitor(store: Store, monitor: Monitor) -> None
     assert not verify(store.log()).reason
 
 
+@pytest.mark.slow
 def test_machines_and_samples_grouped_in_any_way_give_the_same_bytes(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -408,6 +409,7 @@ def test_an_alarm_is_acknowledged_by_somebody_with_a_name(store: Store, who: str
     assert not list(store.log("acknowledge"))
 
 
+@pytest.mark.slow
 def test_a_report_that_fails_and_the_end_leave_no_alarm_waited_for(store: Store) -> None:
     live, made = opened(store), rows(recorded(5, LEAK))
 
@@ -438,6 +440,7 @@ def test_an_alarm_whose_samples_were_removed_says_so(folder: Path, tmp_path: Pat
         assert "max_samples" in first["note"]
 
 
+@pytest.mark.slow
 def test_a_stored_stream_gives_the_same_alarms_again(
     store: Store, folder: Path, tmp_path: Path
 ) -> None:

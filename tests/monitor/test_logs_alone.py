@@ -47,6 +47,7 @@ def test_a_level_that_differs_is_an_event_until_it_ends(monitor: Monitor) -> Non
     assert not monitor.watch(run).alarms
 
 
+@pytest.mark.slow
 def test_what_is_seen_is_saved_and_true(monitor: Monitor, tmp_path: Path) -> None:
     found = visible_sizes(monitor, sensors(2, 1200), possible_causes(monitor.twin))
     rows = {each.fault: each for each in found}

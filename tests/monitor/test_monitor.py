@@ -101,6 +101,7 @@ def test_a_leak_is_found_in_the_machine_that_leaks_alone(monitor: Monitor) -> No
     assert found.score.shape == (3, 600, 2)
 
 
+@pytest.mark.slow
 def test_however_samples_are_cut_the_results_are_the_same_bytes(monitor: Monitor) -> None:
     whole = leaking()
     wanted = cut(monitor, whole, [])
@@ -136,6 +137,7 @@ def test_an_event_lasts_until_the_twin_follows_again(monitor: Monitor) -> None:
     assert not found.void.any()
 
 
+@pytest.mark.slow
 def test_an_event_that_does_not_end_is_a_change_and_new_faults_alarm(monitor: Monitor) -> None:
     soon = replace(monitor, lasting=10.0)
     found = soon.watch(
@@ -163,6 +165,7 @@ def test_the_state_is_arrays_that_are_joined_and_divided(monitor: Monitor) -> No
     np.testing.assert_array_equal(own.evidence, wanted.evidence[[2, 1]])
 
 
+@pytest.mark.slow
 def test_a_machine_that_was_rebuilt_voids_the_promise(monitor: Monitor) -> None:
     found = replace(monitor, lasting=5.0).watch(record(1, 7, steps=1200, drain=2.6))
     assert "changed" in {each.how for each in found.endings}
@@ -263,6 +266,7 @@ def test_other_channels_and_too_few_samples_are_refused(
         fit_monitor(TANK, record(1, 0))  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_values_that_no_healthy_machine_gives_are_named(twin: DynamicsTwin) -> None:
     healthy = record(1, 1)
     huge, frozen = healthy.observed.copy(), healthy.observed.copy()
@@ -302,6 +306,7 @@ def named_causes(monitor: Monitor, watched: rt.Trajectories) -> tuple[list[str],
     return [each.name for each in found if not each.same], len(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [None, 40.0])
 def test_a_fault_that_lasts_or_ends_is_the_only_cause_of_its_event(
     monitor: Monitor, end: float | None
@@ -323,6 +328,7 @@ def test_an_alarm_just_after_the_first_one_names_no_second_fault(monitor: Monito
     assert cause.same
 
 
+@pytest.mark.slow
 def test_a_second_fault_in_an_event_is_named(monitor: Monitor) -> None:
     leak = ParameterShift("drain", size=1.3, onset=30.0, end=33.0)
     one = record(1, 5, faults=[leak])

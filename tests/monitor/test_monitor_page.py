@@ -10,6 +10,7 @@ import pytest
 PAGE = Path(__file__).parents[2] / "docs" / "monitor.md"
 
 
+@pytest.mark.slow
 def test_the_example_raises_its_alarm_after_the_change(capsys: pytest.CaptureFixture[str]) -> None:
     text = PAGE.read_text("utf-8")
     names: dict[str, Any] = {}

@@ -45,6 +45,7 @@ def watched(place: Path, folder: Path, record: rt.Trajectories) -> Store:
     return store
 
 
+@pytest.mark.slow
 def test_quiet_hours_make_a_version_in_the_shadow(tmp_path: Path, folder: Path) -> None:
     with watched(tmp_path / "s", folder, shifted(5, 1600, slice(600, 700))) as store:
         assert list(store.log("end"))
@@ -76,6 +77,7 @@ def test_two_parts_that_can_be_compared_are_enough(tmp_path: Path, folder: Path)
                     recalibrate(store, "a")
 
 
+@pytest.mark.slow
 def test_an_event_that_lasts_needs_the_word_that_it_is_normal(tmp_path: Path, folder: Path) -> None:
     store = watched(tmp_path / "s", folder, shifted(5, 1600, slice(600, None)))
     with store, pytest.raises(InputError, match="new normal") as error:

@@ -115,6 +115,7 @@ def test_arrays_that_do_not_fit(study: Study, write: Write, name: str, value: ND
         read_study(write(study))
 
 
+@pytest.mark.slow
 def test_what_a_study_keeps_of_poses(
     case: rt.Case, twin_set: rt.Trajectories, tmp_path: Path
 ) -> None:

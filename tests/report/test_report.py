@@ -65,6 +65,7 @@ def read(folder: Path) -> Reader:
     return reader
 
 
+@pytest.mark.slow
 def test_page_is_self_contained_and_figures_are_beside_it(study: Study, write: Write) -> None:
     folder = write(study)
     page = write_report(folder, figures=True)

@@ -79,6 +79,7 @@ def subject(request: pytest.FixtureRequest) -> CorrectionSubject:
     return CorrectionSubject(correction, context, draw(context))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("check", CORRECTION_CHECKS, ids=lambda check: check.__name__)
 def test_correction(subject: CorrectionSubject, check: Callable) -> None:
     check(subject)

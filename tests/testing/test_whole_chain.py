@@ -289,6 +289,7 @@ def short(request: pytest.FixtureRequest) -> Toy:
     return PADDED[request.param]
 
 
+@pytest.mark.slow
 def test_padding_changes_no_discrepancy(short: Toy) -> None:
     """z*, its covariance, what is identified and what is left are those of the record itself."""
     record = lossy(short.measured(3), seed=4)
@@ -462,6 +463,7 @@ def test_the_units_of_outputs_do_not_matter(name: str, correction: rt.Correction
     assert (error <= 0.1 * size + 2e-3 * np.array(scale) + 2e-3 * offset).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("density", [DENSITY, STEPWISE])
 def test_no_discrepancy_at_all(density: Density | SequenceMixture) -> None:
     """A real system that is the twin: nothing is added to it, and every figure is a number."""

@@ -236,6 +236,7 @@ def test_a_run_that_fails_ends_alone(lag: Path, workers: int) -> None:
     assert reported[-1] == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="forks")
 def test_an_fmu_that_forks_leaves_no_processes(
     lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

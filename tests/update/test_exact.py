@@ -50,6 +50,7 @@ def measured() -> rt.Trajectories:
     return made.replace(observed=observed.astype(np.float32), labels=np.full(4, "Healthy"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("twin", [TWIN, Module()], ids=["function", "module"])
 @pytest.mark.parametrize("correction", [rt.DelayOffset(), rt.CommandSpace()], ids=["out", "in"])
 def test_a_twin_is_corrected_without_a_surrogate(

@@ -20,6 +20,7 @@ def test_default_reaches_a_third_of_a_millimetre(case: rt.Case) -> None:
         assert ibg.fitted.figures[f"rmse_{axis}"] <= 3e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", [rt.LSTM(16), rt.TCN(16, levels=3)], ids=repr)
 def test_networks_with_memory_learn_too(
     network: rt.LSTM | rt.TCN, twin_set: rt.Trajectories
@@ -58,6 +59,7 @@ def test_an_output_that_never_changes_is_exact_in_any_unit(network: rt.LSTM | rt
     assert np.ptp(found[..., 0]) > 0, "outputs that change are learned as before"
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes(twin_set: rt.Trajectories, tmp_path: Path) -> None:
     brief = Training(max_epochs=1)
     for name in ("a", "b"):

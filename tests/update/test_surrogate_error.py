@@ -17,6 +17,8 @@ from retwin.update import OutsideTrainingWarning
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.surrogate_error import surrogate_variance
 
+pytestmark = pytest.mark.slow
+
 CHANNELS = (
     rt.Channels(("shoulder", "elbow"), ("deg", "deg")),
     rt.Channels(("x", "y"), ("mm", "mm")),

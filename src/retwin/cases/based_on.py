@@ -17,7 +17,7 @@ from retwin.twins.wrappers.parametric import Parameter
 CONTENTS = "see docs/own_twin.md for what it holds"
 
 
-def merged(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Path | str]:
+def merge_bases(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Path | str]:
     """The settings of a file and of that on which it is based, and the folder of the latter.
 
     A key of this file replaces that of the base; of `parameters`, the settings of each parameter
@@ -60,7 +60,7 @@ def merged(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Pa
         got=repr(base),
         remedy="name the case that holds all settings",
     )
-    inner, home = merged(other, above)
+    inner, home = merge_bases(other, above)
     for name, value in settings.items():
         old = inner.get(name)
         if name == "parameters" and isinstance(old, Mapping) and isinstance(value, Mapping):

@@ -282,7 +282,7 @@ def record_in(
         ]
         found = np.array(columns).T.reshape(count, len(channels))
         if clock is not None:
-            found = clock.sampled(seconds, found, rate, held=held)
+            found = clock.resample(seconds, found, rate, held=held)
         return found[None]
 
     held = clock is not None and clock.commands == "hold"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin import catalog
-from retwin.cases.based_on import merged, parameters_of, updated_built_in
+from retwin.cases.based_on import merge_bases, parameters_of, updated_built_in
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.named_twin import delayed_twin, imported, parametric_twin, read_twin
@@ -107,7 +107,7 @@ def read_case(path: str | Path) -> Case:
 
     """
     path, place = Path(path), f"{path}:"
-    settings, home = merged(path)
+    settings, home = merge_bases(path)
     if isinstance(home, str):
         return updated_built_in(home, settings, place)
     named = (catalog.CORRECTIONS, catalog.DENSITIES, catalog.NETWORKS)
@@ -139,7 +139,7 @@ def read_case(path: str | Path) -> Case:
     sensor_rate = twin.rate if keys.sensor_rate is None else keys.sensor_rate
     faults = {HEALTHY: None, **_faults(keys.faults, twin, folder, key(place, "faults"))}
     causes = _faults(keys.causes, twin, folder, key(place, "causes"))
-    network = _chosen(network, catalog.NETWORKS, key(place, "network"))
+    network = _choose(network, catalog.NETWORKS, key(place, "network"))
     sensor_rate = sample_rate(key(place, "sensor_rate"), sensor_rate)
     with at(place):
         return Case(
@@ -166,16 +166,16 @@ def _residual(
     keys: CaseFile, sampler: CommandSampler, place: str
 ) -> tuple[Correction, Density | SequenceMixture, Correction]:
     """The correction, its density, and the correction at the outputs; defaults by the commands."""
-    correction = _chosen(
+    correction = _choose(
         keys.correction or ("delay_offset" if _has_segments(sampler) else "additive"),
         catalog.CORRECTIONS,
         key(place, "correction"),
     )
     stepwise = correction.resolution == "step"
     density = keys.density or (SequenceMixture() if stepwise else Mixture())
-    density = _chosen(density, catalog.DENSITIES, key(place, "density"))
+    density = _choose(density, catalog.DENSITIES, key(place, "density"))
     at_outputs = keys.output_correction or (correction if stepwise else DelayOffset())
-    at_outputs = _chosen(at_outputs, catalog.CORRECTIONS, key(place, "output_correction"))
+    at_outputs = _choose(at_outputs, catalog.CORRECTIONS, key(place, "output_correction"))
     check_density(correction, density, key(place, "density"))
     require(
         at_outputs.resolution == correction.resolution,
@@ -233,7 +233,7 @@ def _is_static(twin: Twin, sampler: CommandSampler) -> bool:
     return bool(np.allclose(ideal[:, order], other, rtol=0, atol=1e-6 * scale))
 
 
-def _chosen(value: Any, entries: Mapping[str, catalog.Entry], place: str) -> Any:
+def _choose(value: Any, entries: Mapping[str, catalog.Entry], place: str) -> Any:
     """The implementation of that name in the catalog; an object stays as it is."""
     return catalog.make(entries, value, place) if isinstance(value, str) else value
 
@@ -290,13 +290,13 @@ def _sampler(
     limits: Limits | None = getattr(twin, "limits", None)
     if set(value) == {"file"}:
         return sampler_from(
-            _recorded(value, twin, records, folder, place), twin.rate, limits=limits
+            _read_commands(value, twin, records, folder, place), twin.rate, limits=limits
         )
     settings = {"kind": RampSampler.__name__, "rate": twin.rate, **value}
     if settings["kind"] == RecordedSampler.__name__:
         options = {name: v for name, v in settings.items() if name not in ("kind", "file")}
         own_settings = checked(RecordedSampler, options, place=place, besides=("commands",))
-        commands = _recorded(settings, twin, records, folder, place)
+        commands = _read_commands(settings, twin, records, folder, place)
         with at(place):
             return RecordedSampler(commands, **own_settings)
     if limits is not None:
@@ -304,7 +304,7 @@ def _sampler(
     return from_config(settings, SAMPLERS, place=place)
 
 
-def _recorded(
+def _read_commands(
     settings: Mapping[str, Any], twin: Twin, records: Records | None, folder: Path, place: str
 ) -> NDArray:
     """The commands (n, T, d_u) of trajectories in a `file`, or of a table's calibration records."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
-from retwin.cases.matching import matched
+from retwin.cases.matching import match_twin
 from retwin.cases.measured import usable
 from retwin.cases.named_signals import (
     check_named,
@@ -21,7 +21,7 @@ from retwin.cases.named_signals import (
     signals_of,
 )
 from retwin.catalog import LOGS
-from retwin.checks import finite, require
+from retwin.checks import at_least, finite, require
 from retwin.data.io import load
 from retwin.data.logs.mapped import mapped
 from retwin.data.logs.mapping import NO_NOMINAL, TimeSettings, read_mapping
@@ -218,13 +218,7 @@ class LogReader:
         progress: Progress | None = None,
     ) -> Logs:
         """See `read_logs`."""
-        require(
-            paths,
-            "logs",
-            expected="one log at least",
-            got="none",
-            remedy="name the files with the measurements",
-        )
+        at_least("logs", paths, 1, "log", remedy="name the files with the measurements")
         self._check_columns(twin)
         notes: dict[str, list[str]] = {}
         sets, tests = [], []
@@ -268,13 +262,13 @@ class LogReader:
         if mapping is not None:
             rate = None if read_mapping(mapping).rate else twin.rate
             found = load(path, rate=rate, max_bytes=self.max_bytes, mapping=mapping)
-            made = matched(found, twin, names, path.name, notes, mapped=True)
+            made = match_twin(found, twin, names, path.name, notes, mapped=True)
             _add_notes(found, path.name, notes)
             return made, []
         if is_log(path):
             return self._by_names(path, twin, notes, rows_at_rate=rows_at_rate), []
         found = load(path, case=case, max_bytes=self.max_bytes)
-        return matched(found, twin, names, path.name, notes), []
+        return match_twin(found, twin, names, path.name, notes), []
 
     def _by_names(
         self, path: Path, twin: Twin, notes: dict[str, list[str]], *, rows_at_rate: bool
@@ -302,7 +296,7 @@ class LogReader:
         else:
             notes.setdefault(resampling_of(log, mapping, twin.rate), []).append(path.name)
         _add_notes(found, path.name, notes, whole=True)
-        return matched(found, twin, {}, path.name, notes)
+        return match_twin(found, twin, {}, path.name, notes)
 
     def _log(self, path: Path, rate: float) -> Log:
         """The signals of a log; rows of a table without times are at that rate in Hz."""

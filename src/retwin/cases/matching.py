@@ -12,7 +12,7 @@ from retwin.data.trajectories import Channels, Trajectories
 from retwin.twins.twin import Twin
 
 
-def matched(
+def match_twin(
     found: Trajectories,
     twin: Twin,
     names: Mapping[str, str],

@@ -8,9 +8,6 @@ from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 
-LARGEST = 1e30
-"""Magnitude from which a number is no measurement: programs write 3.4e38 for a missing one."""
-
 
 def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -> Trajectories:
     """The healthy and the unlabelled trajectories, without their outputs in the first seconds.
@@ -33,7 +30,7 @@ def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -
     joined = _healthy(found, notes)
     _check_size(joined)
     if transient:
-        joined = _settled(joined, transient)
+        joined = _mask_transient(joined, transient)
     unseen = ~joined.mask.any(axis=(0, 1))
     if unseen.any():
         lacking = ", ".join(np.array(joined.outputs.names)[unseen])
@@ -59,16 +56,23 @@ def _healthy(found: Trajectories, notes: dict[str, list[str]]) -> Trajectories:
     return found[kept]
 
 
-def _check_size(found: Trajectories) -> None:
-    """Refuse numbers that stand for missing measurements."""
+def _check_size(found: Trajectories, *, largest: float = 1e30) -> None:
+    """Refuse numbers that stand for missing measurements.
+
+    Parameters
+    ----------
+    largest : float, default 1e+30
+        Magnitude from which a number is no measurement: programs write 3.4e38 for a missing one.
+
+    """
     for name, values in (("observed", found.observed), ("commands", found.commands)):
-        large = np.argwhere(np.abs(values) >= LARGEST)
+        large = np.argwhere(np.abs(values) >= largest)
         channels = found.outputs if name == "observed" else found.inputs
         if len(large):
             row, sample, channel = large[0]
             raise InputError(
                 str(found.ids[row]),
-                expected=f"numbers below {LARGEST:g}",
+                expected=f"numbers below {largest:g}",
                 got=f"{values[row, sample, channel]:g} for {channels.names[channel]} at "
                 f"{sample / found.rate:g} s",
                 remedy="leave the cell empty, or write NaN, where a measurement is missing",
@@ -86,7 +90,7 @@ def _constant(found: Trajectories) -> list[str]:
     ]
 
 
-def _settled(found: Trajectories, transient: float) -> Trajectories:
+def _mask_transient(found: Trajectories, transient: float) -> Trajectories:
     """The trajectories without their outputs in the first seconds."""
     mask = found.mask.copy()
     mask[:, : round(transient * found.rate)] = False

@@ -18,8 +18,6 @@ from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.twins.twin import Twin
 
-ROUNDED = 1e-3
-"""Relative difference of rates that count as equal."""
 LISTED = 12
 """Signals that a message lists, at most."""
 
@@ -72,12 +70,12 @@ def check_there(name: str, column: str, there: Iterable[str]) -> None:
         column in there,
         name,
         expected=f"a column {column!r}",
-        got=f"columns {_listed(there)}",
+        got=f"columns {_list(there)}",
         remedy="name the columns as the header of the file does",
     )
 
 
-def _listed(names: Iterable[str]) -> str:
+def _list(names: Iterable[str]) -> str:
     every = list(names)
     more = f", … ({len(every)} in all)" if len(every) > LISTED else ""
     return ", ".join(every[:LISTED]) + more
@@ -115,7 +113,7 @@ def check_named(log: Log, twin: Twin, named: Mapping[str, str], *, table: bool) 
         not lacking,
         log.name,
         expected=f"a {what} for every command, {', '.join(twin.inputs.names)}",
-        got=f"{all_of} {_listed(log.signals)}; none for {', '.join(lacking)}",
+        got=f"{all_of} {_list(log.signals)}; none for {', '.join(lacking)}",
         remedy=f"give --column {lacking[0]}=NAME, --inputs with the names of the inputs that "
         f"were recorded, {mapped}"
         if lacking
@@ -125,7 +123,7 @@ def check_named(log: Log, twin: Twin, named: Mapping[str, str], *, table: bool) 
         any(each in found for each in twin.outputs.names),
         log.name,
         expected=f"a {what} for an output of the twin, {', '.join(twin.outputs.names)}",
-        got=f"{all_of} {_listed(log.signals)}",
+        got=f"{all_of} {_list(log.signals)}",
         remedy=f"give --column {twin.outputs.names[0]}=NAME, {mapped}",
     )
 
@@ -196,8 +194,15 @@ def has_times(log: Log, time: TimeSettings) -> bool:
     return bool(time.rate) or EVEN not in log.skipped.values()
 
 
-def resampling_of(log: Log, mapping: LogMapping, rate: float) -> str:
-    """How the values of a log come to the sample rate."""
+def resampling_of(log: Log, mapping: LogMapping, rate: float, *, rounded: float = 0.001) -> str:
+    """How the values of a log come to the sample rate.
+
+    Parameters
+    ----------
+    rounded : float, default 0.001
+        Relative difference of rates that count as equal.
+
+    """
     place = next((name for name, why in log.skipped.items() if why == TIMES), "")
     where = f"times in column {place}, " if place else ""
     own, held = [], 0.0
@@ -214,6 +219,6 @@ def resampling_of(log: Log, mapping: LogMapping, rate: float) -> str:
     if not own:
         return f"{where}a row per sample at {rate:g} Hz"
     low, high = min(own), max(own)
-    shown = f"{low:.4g}" if high < (1 + ROUNDED) * low else f"{low:.4g} to {high:.4g}"
+    shown = f"{low:.4g}" if high < (1 + rounded) * low else f"{low:.4g} to {high:.4g}"
     rows = f", commands are held where rows are left out, for {held:.2g} s at most" if held else ""
     return f"{where}values at {shown} Hz (median) are brought to {rate:g} Hz{rows}"

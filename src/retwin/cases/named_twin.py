@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from retwin import twins
-from retwin.checks import existing, nothing, require
+from retwin.checks import at_most, existing, nothing, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.modules import import_beside
@@ -28,10 +28,6 @@ FILES: dict[str, Any] = {".fmu": FMUTwin, ".xml": MuJoCoTwin, ".urdf": MuJoCoTwi
 """The kind of twin that a file of each suffix holds."""
 ELSEWHERE = ("path", "function", "inputs", "outputs", "sensors", "rate", "limits")
 """Parameters of twins that other keys of a case.toml set."""
-
-MAX_CHANNELS = 10_000
-"""Largest number of inputs, and of outputs, in a case.toml: more take minutes to read, and a
-trajectory takes hundreds of MB."""
 
 
 @dataclass(frozen=True)
@@ -202,16 +198,19 @@ def _making(options: dict[str, Any], place: str, *names: str) -> _Making:
     return from_settings(_Making, {n: options.pop(n) for n in names if n in options}, place=place)
 
 
-def _channels(given: Named, place: str) -> dict[str, _Channel]:
-    """A table of each channel, for which its name alone may stand."""
+def _channels(given: Named, place: str, *, max_channels: int = 10000) -> dict[str, _Channel]:
+    """A table of each channel, for which its name alone may stand.
+
+    Parameters
+    ----------
+    max_channels : int, default 10000
+        Largest number of inputs, and of outputs, in a case.toml: more take minutes to read, and a
+        trajectory takes hundreds of MB.
+
+    """
     tables = given if isinstance(given, Mapping) else {name: {} for name in given}
-    require(
-        len(tables) <= MAX_CHANNELS,
-        place,
-        expected=f"at most {MAX_CHANNELS} channels",
-        got=len(tables),
-        remedy="leave out those that are constant, or split the system",
-    )
+    remedy = "leave out those that are constant, or split the system"
+    at_most(place, len(tables), max_channels, "channels", remedy=remedy)
     return {
         name: from_settings(_Channel, value, place=key(place, name))
         for name, value in tables.items()

@@ -140,19 +140,19 @@ def open_parametric(
         twin = twins.get(name, inputs=tuple(inputs), outputs=tuple(outputs), rate=rate)
     if isinstance(twin, StateTwin) and twin.free:
         twin = twin.parametric()
-    known = tuple(_known(twin))
-    made = _freed(twin, _chosen(known, free, name))
+    known = tuple(_list_known(twin))
+    made = _free(twin, _choose_free(known, free, name))
     return OpenedTwin(name, made, known, case, not (inputs or outputs or rate))
 
 
-def _known(twin: Twin) -> Iterator[Known]:
+def _list_known(twin: Twin) -> Iterator[Known]:
     """What a twin states about its parameters; declared ones come first."""
     if isinstance(twin, ParametricTwin):
         own = zip(twin.parameters, twin.values, strict=True)
         yield from (Known(p.name, p.unit, value, p.low, p.high) for p, value in own)
         places = {place for p in twin.parameters for place in p.places} | set(twin.names)
         held = dict(twin.held)
-        for each in _known(twin.twin):
+        for each in _list_known(twin.twin):
             if each.name not in places:
                 yield replace(each, value=held.get(each.name, each.value))
     elif isinstance(twin, FMUTwin):
@@ -171,7 +171,7 @@ def _known(twin: Twin) -> Iterator[Known]:
                 yield Known(taken.name, "1", float(default))
 
 
-def _chosen(known: Sequence[Known], free: Sequence[str], name: str) -> list[Parameter]:
+def _choose_free(known: Sequence[Known], free: Sequence[str], name: str) -> list[Parameter]:
     """The free parameters, from what the user gives and what the twin states."""
     by_name = {each.name: each for each in known}
     if not free:
@@ -181,7 +181,7 @@ def _chosen(known: Sequence[Known], free: Sequence[str], name: str) -> list[Para
             "--free",
             expected="at least one parameter and its range, since the twin states no range",
             got="none",
-            remedy=f"give for instance --free {known[0].name}=LOW:HIGH; {_listed(known)}"
+            remedy=f"give for instance --free {known[0].name}=LOW:HIGH; {_list(known)}"
             if known
             else f"{name} names no parameters: give a function keyword arguments with numbers as "
             "defaults, or declare [parameters] in a case.toml",
@@ -190,13 +190,8 @@ def _chosen(known: Sequence[Known], free: Sequence[str], name: str) -> list[Para
     made = [_parameter(text, by_name, known) for text in free]
     names = [each.name for each in made]
     twice = sorted({each for each in names if names.count(each) > 1})
-    require(
-        not twice,
-        "--free",
-        expected="each parameter once",
-        got=f"{', '.join(twice)} twice",
-        remedy="leave one of them out",
-    )
+    repeated = (f"{each} twice" for each in twice)
+    nothing("--free", repeated, "each parameter once", remedy="leave one of them out")
     return made
 
 
@@ -210,7 +205,7 @@ def _parameter(text: str, by_name: dict[str, Known], known: Sequence[Known]) -> 
             "--free",
             expected=f"a range for {name}, since the twin states none" if name in by_name else FORM,
             got=repr(text),
-            remedy=f"write --free {name or 'NAME'}=LOW:HIGH; {_listed(known)}",
+            remedy=f"write --free {name or 'NAME'}=LOW:HIGH; {_list(known)}",
         )
         return found.parameter
     try:
@@ -235,11 +230,11 @@ def _parameter(text: str, by_name: dict[str, Known], known: Sequence[Known]) -> 
     return Parameter(name, found.unit, low, high, begin)
 
 
-def _freed(twin: Twin, chosen: Sequence[Parameter]) -> ParametricTwin:
+def _free(twin: Twin, chosen: Sequence[Parameter]) -> ParametricTwin:
     """The twin with these parameters free and the others held."""
     if not isinstance(twin, ParametricTwin):
         if isinstance(twin, MuJoCoTwin):
-            chosen = [_started(each, twin) for each in chosen]
+            chosen = [_set_start(each, twin) for each in chosen]
         return parametric_twin(twin, chosen, "--free")
     made, own = twin.freed(chosen), None
     if isinstance(twin.twin, RebuiltTwin):
@@ -252,7 +247,7 @@ def _freed(twin: Twin, chosen: Sequence[Parameter]) -> ParametricTwin:
     return made
 
 
-def _started(parameter: Parameter, twin: MuJoCoTwin) -> Parameter:
+def _set_start(parameter: Parameter, twin: MuJoCoTwin) -> Parameter:
     """The same with the model's own value as its start, for places that no list suggests."""
     value = parameter_value(twin.model, parameter.name)
     inside = parameter.low <= value <= parameter.high
@@ -261,7 +256,7 @@ def _started(parameter: Parameter, twin: MuJoCoTwin) -> Parameter:
     return parameter if given else replace(parameter, start=value)
 
 
-def _listed(known: Sequence[Known]) -> str:
+def _list(known: Sequence[Known]) -> str:
     """The parameters that there are, with their present values."""
 
     def described(each: Known) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import one_of, positive, require
 from retwin.data.logs.signals import NANOSECOND, NANOSECONDS, Clock
-from retwin.data.resampling import SAME, Resampling, longest_bridge, resampled
+from retwin.data.resampling import SAME, Resampling, longest_bridge, resample
 from retwin.data.row_times import row_times
 from retwin.data.tables import Table
 
@@ -110,7 +110,7 @@ class TimeColumn:
         )
         return elapsed
 
-    def sampled(self, seconds: NDArray, values: NDArray, rate: float, *, held: bool) -> NDArray:
+    def resample(self, seconds: NDArray, values: NDArray, rate: float, *, held: bool) -> NDArray:
         """Values (T, d) at times (T,) in s, as samples (N, d) at a rate in Hz; NaN where missing.
 
         `held` values are constant until the next, others change along straight lines.
@@ -118,5 +118,5 @@ class TimeColumn:
         grid = np.arange(int((seconds[-1] + SAME / rate) * rate) + 1) / rate
         longest = self.max_gap or longest_bridge(seconds, 1 / rate)
         how: Resampling = "hold" if held else "linear"
-        columns = [resampled(seconds, v, grid, 1 / rate, how, longest=longest) for v in values.T]
+        columns = [resample(seconds, v, grid, 1 / rate, how, longest=longest) for v in values.T]
         return np.array(columns).reshape(len(values.T), len(grid)).T

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -132,8 +131,4 @@ def _takes_commands(name: str) -> bool:
     found = _object(name)
     if not callable(found) or (isinstance(found, Twin) and not isinstance(found, type)):
         return False
-    try:
-        inspect.signature(found).bind()
-    except (TypeError, ValueError):
-        return True
-    return False
+    return not twins.needs_no_arguments(found)

@@ -81,7 +81,7 @@ def updated_case(
         is_file=is_file,
         twin=twin,
         channels=_channels(twin) if is_file or not opened.own_channels else {},
-        moving="" if measured is None else _moving(measured),
+        moving="" if measured is None else _describe_motion(measured),
         commands=commands,
         shows_states=bool(state_names(twin)),
         sufficient=SUFFICIENT,
@@ -90,7 +90,7 @@ def updated_case(
     )
 
 
-def _moving(measured: Trajectories) -> str:
+def _describe_motion(measured: Trajectories) -> str:
     """How the commands of logs change: "in ramps" and rest, "in steps", or "all the time".
 
     A delay and an offset per segment suit commands that move in ramps and then rest, as those of a

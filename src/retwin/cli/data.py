@@ -103,7 +103,7 @@ def map_log(
     as_json: Json = False,
 ) -> None:
     """Propose what a log's signals stand for, and draw it with the trajectories they make."""
-    from retwin.data.logs.mapped import tried
+    from retwin.data.logs.mapped import try_mapping
     from retwin.data.logs.mapping import TimeSettings
     from retwin.data.logs.proposal import propose_mapping
     from retwin.report.log_picture import log_picture
@@ -123,7 +123,7 @@ def map_log(
             progress=lambda share: show(log.name, share),
             max_bytes=max_bytes,
         )
-        parts = tried(made.log, made.mapping, case=system)
+        parts = try_mapping(made.log, made.mapping, case=system)
         drawn = log_picture(made.log, parts)
     for place, contents in ((out, made.text.encode()), (picture, drawn)):
         with write_atomically(place) as part:

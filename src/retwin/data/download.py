@@ -29,8 +29,6 @@ MAX_BYTES = 2**32
 """The largest size of a file, unless another is given: no server can fill the disk."""
 BYTES_PER_BLOCK = 64 * 1024
 """Bytes that are received and written together."""
-SECONDS_PER_REPORT = 0.1
-"""Seconds between two reports of progress."""
 
 
 def fetch(
@@ -74,7 +72,7 @@ def fetch(
         The downloaded file has another SHA-256; nothing of it is kept.
 
     """
-    known = _known(name, url, sha256)
+    known = _find_file(name, url, sha256)
     require(
         known.url.startswith(("http://", "https://")),
         "url",
@@ -126,7 +124,7 @@ def cache_folder() -> Path:
     return Path(pooch.os_cache("retwin"))
 
 
-def _known(name: str, url: str | None, sha256: str | None) -> PublicFile:
+def _find_file(name: str, url: str | None, sha256: str | None) -> PublicFile:
     """The entry of the catalog with the caller's changes, or an entry of the caller's own."""
     known = DOWNLOADS.get(name)
     if known is not None:
@@ -150,9 +148,16 @@ def _tidy(folder: Path, place: Path) -> None:
 
 
 def _downloader(
-    budget: Budget, progress: Progress | None
+    budget: Budget, progress: Progress | None, *, seconds_per_report: float = 0.1
 ) -> Callable[[str, str | os.PathLike[str], Any], None]:
-    """A downloader for pooch, whose own one has no limits."""
+    """A downloader for pooch, whose own one has no limits.
+
+    Parameters
+    ----------
+    seconds_per_report : float, default 0.1
+        Seconds between two reports of progress.
+
+    """
 
     def download(url: str, output: str | os.PathLike[str], _: Any) -> None:
         transfer = Transfer(url, output, budget)
@@ -160,7 +165,7 @@ def _downloader(
         transfer.start()
         try:
             while transfer.is_alive():
-                transfer.join(SECONDS_PER_REPORT)
+                transfer.join(seconds_per_report)
                 if progress is not None and transfer.share:
                     progress(transfer.share)
                 if time.monotonic() > deadline:

@@ -10,7 +10,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TextIO
 
-from retwin.checks import require
+from retwin.checks import nothing, require
 from retwin.data.logs.signals import named_units
 from retwin.errors import InputError, brief
 
@@ -22,8 +22,6 @@ SEPARATORS = (";", "\t", ",", "|")
 """Separators in the order in which they are tried; blanks come last."""
 HEAD = 200
 """Lines in which the header and the first rows of numbers are looked for."""
-AGREEING = 12
-"""Rows that must have the same number of columns."""
 LONGEST = 2**20
 """Characters of a line at most."""
 NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf|nan", re.IGNORECASE)
@@ -64,7 +62,7 @@ class Layout:
 
         Raises ValueError if it has more or less than the table.
         """
-        row = _trimmed(row, len(self.names))
+        row = _trim(row, len(self.names))
         if len(row) != len(self.names):
             raise ValueError(f"{len(row)} of {len(self.names)} cells")
         return row
@@ -167,11 +165,10 @@ def text_layout(
         tuple(unit or other for unit, (_, other) in zip(own, pairs, strict=True)),
     )
     missing = [each for each in wanted if each not in (*layout.titles, *names)]
-    require(
-        not missing,
+    nothing(
         place,
-        expected=f"a header with the columns {', '.join(wanted)}",
-        got=f"no column {', '.join(missing)}",
+        (f"no column {each}" for each in missing),
+        f"a header with the columns {', '.join(wanted)}",
         remedy="name the columns as the file does",
     )
     return layout
@@ -195,7 +192,7 @@ def _by_titles(
             width = len(row) - (not plain[-1])
             columns = [(plain if each in plain else names).index(each) for each in wanted]
             below = next((k for k in range(at + 1, len(rows)) if rows[k]), at + 1)
-            units = _trimmed(rows[below], width) if below < len(rows) else ()
+            units = _trim(rows[below], width) if below < len(rows) else ()
             some = [units[each] for each in columns] if len(units) == width else []
             if any(map(str.strip, some)) and not _holds_numbers(some, separator != ","):
                 return separator, below + 1, row[:width], units
@@ -231,7 +228,7 @@ def _by_numbers(lines: Sequence[str], place: str) -> tuple[str, int, Row, Row]:
     return separator, first, head[-1] if head else [""] * width, ()
 
 
-def _trimmed(row: Row, width: int) -> Row:
+def _trim(row: Row, width: int) -> Row:
     return row[:-1] if len(row) == width + 1 and not row[-1].strip() else row
 
 
@@ -248,9 +245,7 @@ def _head(rows: Sequence[Row], width: int, place: str) -> Sequence[Row]:
 
     Raises InputError for one that seems to hold damaged numbers, which would be left out.
     """
-    full = [
-        (number, row) for number, row in enumerate(rows, 1) if len(_trimmed(row, width)) == width
-    ]
+    full = [(number, row) for number, row in enumerate(rows, 1) if len(_trim(row, width)) == width]
     for number, row in full[1:]:
         filled = [cell.strip() for cell in row if cell.strip()]
         require(
@@ -278,10 +273,17 @@ def _holds_numbers(row: Row, comma: bool) -> bool:
     return count > 0 and 2 * count >= len(filled)
 
 
-def _first_row(rows: Sequence[Row], *, comma: bool) -> int | None:
-    """The first row from which on all have the same number of cells, numbers among them."""
+def _first_row(rows: Sequence[Row], *, comma: bool, agreeing: int = 12) -> int | None:
+    """The first row from which on all have the same number of cells, numbers among them.
+
+    Parameters
+    ----------
+    agreeing : int, default 12
+        Rows that must have the same number of columns.
+
+    """
     for place, row in enumerate(rows):
-        following = [each for each in rows[place : place + AGREEING] if any(map(str.strip, each))]
+        following = [each for each in rows[place : place + agreeing] if any(map(str.strip, each))]
         # The last line may be cut off; the rows below say so when they are read.
         same = following[: max(1, len(following) - 1)]
         if any(map(str.strip, row)) and all(

@@ -22,7 +22,7 @@ def longest_bridge(times: NDArray, period: float) -> float:
     return BRIDGED * max(period, typical)
 
 
-def resampled(
+def resample(
     times: NDArray,
     values: NDArray,
     grid: NDArray,

@@ -27,8 +27,6 @@ SHORT, WHOLE = 1e-3, 1e-2
 relative to it: times in s have other intervals."""
 MISREAD = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "minutes": 60.0, "hours": 3600.0, "days": DAY}
 """Seconds of the units that times without a unit may have, besides seconds."""
-SIMILAR = 1.3
-"""Ratio of two intervals up to which one may stand for the other in another unit."""
 SPELT = {"sec": "s", "seconds": "s", "µs": "us", "μs": "us"}
 """Other spellings of units."""
 
@@ -56,10 +54,17 @@ def unit_in(name: str) -> str:
     return last if last in NANOSECONDS else ""
 
 
-def misread_unit(interval: float, period: float) -> str:
-    """The unit that makes an interval a sample period, which was read as so many s; "" if none."""
+def misread_unit(interval: float, period: float, *, similar: float = 1.3) -> str:
+    """The unit that makes an interval a sample period, which was read as so many s; "" if none.
+
+    Parameters
+    ----------
+    similar : float, default 1.3
+        Ratio of two intervals up to which one may stand for the other in another unit.
+
+    """
     for unit, seconds in MISREAD.items():
-        if 1 / SIMILAR < interval * seconds / period < SIMILAR:
+        if 1 / similar < interval * seconds / period < similar:
             return unit
     return ""
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import check_finite, check_shapes, floating, measured, named, row_blocks
-from retwin.checks import agree, at_least, require, whole
+from retwin.checks import agree, at_least, one_per, require, whole
 from retwin.data.provenance import Provenance
 from retwin.times import sample_rate, to_samples
 
@@ -160,13 +160,7 @@ class Trajectories:
             ("inputs", inputs, commands.shape[2]),
             ("outputs", outputs, nominal.shape[2]),
         ):
-            require(
-                len(channels) == width,
-                name,
-                expected=f"{width} channels, as the array has columns",
-                got=f"{len(channels)}: {list(channels.names)}",
-                remedy="name every column",
-            )
+            one_per(name, channels, width, "column of the array", remedy="name every column")
         checked = (commands, nominal, observed, mask, labels, ids)
         arrays = {name: each.view() for name, each in zip(PER_TRAJECTORY, checked, strict=True)}
         for array in arrays.values():

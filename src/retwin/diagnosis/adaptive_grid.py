@@ -16,18 +16,36 @@ from numpy.typing import NDArray
 
 CELLS = {1: 48, 2: 12, 3: 8}
 """Cells along each side at first, by the number of quantities that are open."""
-NEGLIGIBLE = 8.0
-"""How many nats below the largest contribution a cell is refined no further: 3e-4 of it."""
-MIN_REFINED = 12
-"""Number of cells that are refined at least, since a maximum may lie off all centres."""
-MAX_REFINED = 500
-"""Number of cells that are refined at most, for likelihoods that hardly depend on anything."""
-TOLERANCE = 0.05
-"""Change of the log integral in nats, below which there is no further round."""
-MAX_CELL_SHARE = 0.03
-"""Share of one cell, below which there is no further round: intervals are no finer than a cell."""
-ROUNDS = 30
-"""Rounds at most."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Which cells are refined, and when there is no further round.
+
+    Parameters
+    ----------
+    negligible : float
+        How many nats below the largest contribution a cell is refined no further: 3e-4 of it.
+    min_refined : int
+        Number of cells that are refined at least, since a maximum may lie off all centres.
+    max_refined : int
+        Number of cells that are refined at most, for likelihoods that hardly depend on anything.
+    tolerance : float
+        Change of the log integral in nats, below which there is no further round.
+    max_cell_share : float
+        Share of one cell, below which there is no further round: intervals are no finer than a
+        cell.
+    rounds : int
+        Rounds at most.
+
+    """
+
+    negligible: float = 8.0
+    min_refined: int = 12
+    max_refined: int = 500
+    tolerance: float = 0.05
+    max_cell_share: float = 0.03
+    rounds: int = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +71,12 @@ class Integral:
     high: NDArray
 
 
-def integrated(
-    log_likelihood: Callable[[NDArray], NDArray], limits: NDArray, whole: NDArray, coverage: float
+def integrate(
+    log_likelihood: Callable[[NDArray], NDArray],
+    limits: NDArray,
+    whole: NDArray,
+    coverage: float,
+    refinement: Refinement = Refinement(),
 ) -> Integral:
     """Integrate a likelihood over a box.
 
@@ -68,6 +90,8 @@ def integrated(
         Which quantities are whole numbers.
     coverage : float
         Probability of the intervals.
+    refinement : Refinement
+        Which cells are refined.
 
     """
     is_open = limits[:, 1] > limits[:, 0]
@@ -97,21 +121,26 @@ def integrated(
 
     mass = log_mass(cells)
     total = _total(mass)
-    for _ in range(ROUNDS if is_open.any() and np.isfinite(total) else 0):
+    for _ in range(refinement.rounds if is_open.any() and np.isfinite(total) else 0):
         best = cells[np.argmax(mass)]
         # The likelihood may end abruptly, so that a maximum lies at the edge of a poor cell.
         beside = ((cells[..., 0] <= best[:, 1]) & (cells[..., 1] >= best[:, 0])).all(axis=1)
-        lowest = min(np.sort(mass)[-min(MIN_REFINED, len(mass))], mass.max() - NEGLIGIBLE)
+        lowest = min(
+            np.sort(mass)[-min(refinement.min_refined, len(mass))],
+            mass.max() - refinement.negligible,
+        )
         order = np.argsort(np.where(beside, -np.inf, -mass))
         wanted = beside | ((mass >= lowest) & np.isfinite(mass))
-        chosen = order[: min(int(wanted.sum()), MAX_REFINED)]
+        chosen = order[: min(int(wanted.sum()), refinement.max_refined)]
         parts = np.concatenate([_halves(each, whole) for each in cells[chosen]])
         if len(parts) == len(chosen):
             break
         cells = np.concatenate([np.delete(cells, chosen, axis=0), parts])
         mass = np.concatenate([np.delete(mass, chosen), log_mass(parts)])
         before, total = total, _total(mass)
-        if abs(total - before) < TOLERANCE and mass.max() < total + np.log(MAX_CELL_SHARE):
+        if abs(total - before) < refinement.tolerance and mass.max() < total + np.log(
+            refinement.max_cell_share
+        ):
             break
     if not np.isfinite(total):
         return Integral(-np.inf, *[np.full(len(limits), np.nan)] * 4)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.adaptive_grid import Integral, integrated
+from retwin.diagnosis.adaptive_grid import Integral, integrate
 from retwin.twins.faults.actuator_faults import ends_of
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
@@ -30,13 +30,9 @@ from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.likelihood import NoiseVariances, Record, Variants
 from retwin.update.dynamics.prediction import root_of, whitened
 
-COVERAGE = 0.9
-"""Coverage of all intervals."""
 LEVELS = (0.03, 0.1, 0.3, 1.0)
 """Standard deviations of what is unknown: of process noise per sample, in usual steps of a state,
 or of measurement noise, in standard deviations of an output in the record."""
-TOLERANCE = 0.1
-"""Share of a fault's effect by which it may differ from that of its equation."""
 FROZEN = np.array([1.0, 1e-2, 1e-4])
 """Standard deviations of a sensor that is frozen, in those of its noise in calibration."""
 SMALLEST = 0.1
@@ -86,8 +82,15 @@ class FaultEvidence:
         errors = whitened(measured - mean, root_of(covariance, seen), seen)
         return float(np.abs(errors).max()) if np.isfinite(errors).all() else np.inf
 
-    def integral(self, fault: TimedFault | None) -> Integral:
-        """The evidence for a fault, and the posterior of its size, onset and end."""
+    def integral(self, fault: TimedFault | None, *, coverage: float = 0.9) -> Integral:
+        """The evidence for a fault, and the posterior of its size, onset and end.
+
+        Parameters
+        ----------
+        coverage : float, default 0.9
+            Coverage of all intervals.
+
+        """
         steps, rate = len(self.record.commands), self.twin.rate
         if fault is None:
             return Integral(float(self._under(None, NOTHING[None])[0]), *[NOTHING] * 4)
@@ -103,7 +106,7 @@ class FaultEvidence:
             possible = (end >= first) | (limits[2, 0] == limits[2, 1])
             return np.where(possible, own + self._under(fault, points), -np.inf)
 
-        found = integrated(log_likelihood, limits, np.array([False, True, True]), COVERAGE)
+        found = integrate(log_likelihood, limits, np.array([False, True, True]), coverage)
         missing = np.array(
             [not isinstance(fault, SizedFault), False, fault.end is None], dtype=bool
         )
@@ -111,15 +114,23 @@ class FaultEvidence:
         ends = (np.where(missing, np.nan, e / scale) for e in (found.low, found.mean, found.high))
         return Integral(found.evidence, found.best, *ends)
 
-    def tolerated(self, fault: TimedFault | None, found: Integral) -> Integral:
+    def tolerated(
+        self, fault: TimedFault | None, found: Integral, *, tolerance: float = 0.1
+    ) -> Integral:
         """The same with the evidence for a fault whose effect differs somewhat from its equation.
 
         The difference is noise, as probable beforehand as none.
+
+        Parameters
+        ----------
+        tolerance : float, default 0.1
+            Share of a fault's effect by which it may differ from that of its equation.
+
         """
         if fault is None or not np.isfinite(found.evidence):
             return found
         states, outputs = self._effect(fault, found.best)
-        noise = ((TOLERANCE * states) ** 2, (TOLERANCE * outputs) ** 2)
+        noise = ((tolerance * states) ** 2, (tolerance * outputs) ** 2)
         gain = self._gains([(fault, found.best)], noise)[0]
         return replace(found, evidence=found.evidence + float(np.logaddexp(0, gain) - np.log(2)))
 
@@ -192,11 +203,11 @@ class FaultEvidence:
             case SensorFreeze(output=place):
                 seen = np.tile(record.seen, (len(points), 1, 1))
                 pairs = zip(active, seen, strict=True)
-                gain = [self._frozen(place, own, each) for own, each in pairs]
+                gain = [self._density_frozen(place, own, each) for own, each in pairs]
                 return Variants(seen=seen), np.array(gain)
         return Variants(), none
 
-    def _frozen(self, output: int, active: NDArray, seen: NDArray) -> float:
+    def _density_frozen(self, output: int, active: NDArray, seen: NDArray) -> float:
         """Log density of a frozen sensor's samples, which are removed from those `seen` (T, d_y).
 
         It repeats the sample of the onset, with a noise that cannot be smaller than what the steps

@@ -124,7 +124,7 @@ class Features:
             are no commands.
 
         """
-        return self._sampled(trajectories, np.arange(0, trajectories.steps, self.stride))
+        return self._sample(trajectories, np.arange(0, trajectories.steps, self.stride))
 
     def phases(self, trajectories: Trajectories) -> Tensor:
         """The features at each of the `stride` phases at which a sensor may sample.
@@ -144,14 +144,14 @@ class Features:
         """
         first = np.arange(0, trajectories.steps, self.stride)
         time = np.minimum(np.arange(self.stride)[:, None] + first, trajectories.steps - 1)
-        return self._sampled(trajectories, time.ravel()).unflatten(1, time.shape)
+        return self._sample(trajectories, time.ravel()).unflatten(1, time.shape)
 
-    def _sampled(self, trajectories: Trajectories, time: NDArray) -> Tensor:
+    def _sample(self, trajectories: Trajectories, time: NDArray) -> Tensor:
         """Features at the samples `time`, (n, len(time), 2 d_y), computed block by block."""
         remedy = "resample or rename, or train on data like these"
         whose = "what the diagnoser was trained on"
         agree("trajectories", trajectories, self, whose, names=("outputs", "rate"), remedy=remedy)
-        settled = self._settled(trajectories) if self.hide_start else None
+        settled = self._find_settled(trajectories) if self.hide_start else None
         found = np.empty((len(trajectories), len(time), self.width), np.float32)
         for rows in row_blocks(trajectories.nominal):
             nominal = trajectories.nominal[rows][:, time]
@@ -167,7 +167,7 @@ class Features:
             found[rows] = np.concatenate([nominal, residual], axis=2)
         return torch.from_numpy(found)
 
-    def _settled(self, trajectories: Trajectories) -> NDArray:
+    def _find_settled(self, trajectories: Trajectories) -> NDArray:
         """The sample (n,) up to which the start is hidden; the last one if nothing moves."""
         require(
             trajectories.commands.shape[2] > 0,

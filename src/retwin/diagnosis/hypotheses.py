@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from retwin.checks import require
+from retwin.checks import at_least
 from retwin.diagnosis.latent_prior import command_problem, healthy_prior
 from retwin.errors import InputError
 from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
@@ -34,13 +34,8 @@ def checked(faults: Mapping[str, Fault | None]) -> dict[str, Fault | None]:
         There are fewer than two, or one cannot be inverted.
 
     """
-    require(
-        len(faults) > 1,
-        "faults",
-        expected="at least two classes, None for healthy",
-        got=list(faults),
-        remedy="give the faults of a case",
-    )
+    remedy = "give the faults of a case"
+    at_least("faults", faults, 2, "classes, None for healthy", remedy=remedy)
     for fault in faults.values():
         _actuator_and_size(fault)
     return dict(faults)

@@ -34,13 +34,6 @@ from retwin.update.surrogate import Surrogate
 from retwin.update.surrogate_error import surrogate_variance
 from retwin.update.training_range import training_checked
 
-ERRORS = 4.0
-"""Errors of the outputs, over those in calibration, from which on a trajectory is unknown: from few
-calibration trajectories, the quantile of a normal value is far away. None is unknown up to errors
-of 1 + ERRORS/n, if they are fewer, since the n of calibration are explained better than others."""
-ROUNDS = 5
-"""Rounds of expectation-maximisation of the noise."""
-
 
 @overload
 def fit_inversion(
@@ -147,8 +140,23 @@ def _fit(
     faults: Mapping[str, Fault | None],
     twin: Twin | None,
     false_rate: float,
+    *,
+    errors: float = 4.0,
+    rounds: int = 5,
 ) -> InversionDiagnoser:
-    """The diagnoser, its noise and the bound of its answer "unknown" from healthy trajectories."""
+    """The diagnoser, its noise and the bound of its answer "unknown" from healthy trajectories.
+
+    Parameters
+    ----------
+    errors : float, default 4.0
+        Errors of the outputs, over those in calibration, from which on a trajectory is unknown:
+        from few calibration trajectories, the quantile of a normal value is far away. None is
+        unknown up to errors of 1 + ERRORS/n, if they are fewer, since the n of calibration are
+        explained better than others.
+    rounds : int, default 5
+        Rounds of expectation-maximisation of the noise.
+
+    """
     given = DiagnosisInputs.of(surrogate, residual, healthy)
     segments = given.context.segments
     found = surrogate_variance(surrogate, twin, healthy.commands, segments)
@@ -157,15 +165,15 @@ def _fit(
     )
     context, observed, mask = given.with_error(variance)[:]
     problem = command_problem(residual, context, observed, mask)
-    noise = fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS)
+    noise = fitted_noise(problem, healthy_prior(residual, context), rounds=rounds)
     seen: list[bool] = np.any(healthy.mask, axis=(0, 1)).tolist()
     outputs = tuple(compress(healthy.outputs.names, seen))
-    limits = (1.0, min(ERRORS, 1 + ERRORS / len(healthy)), ERRORS)
-    each, near, far = _explained(residual, noise, (context, observed, mask), limits)
-    simulated = _simulated(surrogate, residual, healthy, noise, round(1 / false_rate) - 1)
+    limits = (1.0, min(errors, 1 + errors / len(healthy)), errors)
+    each, near, far = _explain(residual, noise, (context, observed, mask), limits)
+    simulated = _simulate(surrogate, residual, healthy, noise, round(1 / false_rate) - 1)
     others = DiagnosisInputs.of(surrogate, residual, simulated).with_error(variance)[:]
     bound = min(max(lower_bound(each, false_rate), float(far.mean())), float(near.mean()))
-    below = _explained(residual, noise, others)[0] < bound
+    below = _explain(residual, noise, others)[0] < bound
     return InversionDiagnoser(
         surrogate,
         residual,
@@ -177,7 +185,7 @@ def _fit(
     )
 
 
-def _explained(
+def _explain(
     residual: ResidualModel,
     noise: Noise,
     given: tuple[Context, Tensor, Tensor],
@@ -193,7 +201,7 @@ def _explained(
     return [((known.evidence + lost[0] - each) / samples).numpy() for each in lost]
 
 
-def _simulated(
+def _simulate(
     surrogate: Surrogate, residual: ResidualModel, healthy: Trajectories, noise: Noise, count: int
 ) -> Trajectories:
     """So many healthy trajectories of the corrected twin, with noise, measured as these were."""

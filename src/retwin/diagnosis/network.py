@@ -18,9 +18,6 @@ from retwin.nets.training import Fit, Training, isolated, train
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, save_model
 
-TRAJECTORIES_PER_BATCH = 256
-"""Trajectories that are classified together: activations of more would leave the cache."""
-
 
 class NetworkDiagnoser(nn.Module):
     """A neural network that classifies trajectories.
@@ -61,9 +58,16 @@ class NetworkDiagnoser(nn.Module):
         return self.of_features(self.features(trajectories))
 
     @torch.no_grad()
-    def of_features(self, features: Tensor) -> NDArray:
-        """Probabilities (n, classes) of features (n, T', 2 d_y), computed in batches."""
-        batches = features.split(TRAJECTORIES_PER_BATCH)
+    def of_features(self, features: Tensor, *, trajectories_per_batch: int = 256) -> NDArray:
+        """Probabilities (n, classes) of features (n, T', 2 d_y), computed in batches.
+
+        Parameters
+        ----------
+        trajectories_per_batch : int, default 256
+            Trajectories that are classified together: activations of more would leave the cache.
+
+        """
+        batches = features.split(trajectories_per_batch)
         return torch.cat([self(each).double().softmax(dim=1) for each in batches]).numpy()
 
     def save(self, folder: str | Path) -> None:

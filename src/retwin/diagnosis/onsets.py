@@ -21,8 +21,6 @@ COARSE = 25
 """Onsets of each segment that are evaluated first."""
 FINE = 8
 """Samples before and after the best of them that are evaluated one by one."""
-PASSES = 2
-"""Times that the outputs are explained for the best onset."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +53,7 @@ class Onsets:
         """Of every row; where a fault fixes the onset, there is nothing to infer."""
         first, last = rows.onsets.unbind(dim=1)
         open_rows = (last > first).nonzero()[:, 0]
-        found = cls._inferred(rows[open_rows], noise) if len(open_rows) else None
+        found = cls._infer(rows[open_rows], noise) if len(open_rows) else None
         size = 1 if found is None else found.samples.shape[1]
         samples = first[:, None].repeat(1, size)
         probability = torch.zeros(samples.shape, dtype=torch.float64)
@@ -69,11 +67,11 @@ class Onsets:
         return cls(samples, probability, best, gain, information)
 
     @classmethod
-    def _inferred(cls, rows: Hypotheses, noise: Noise) -> Onsets:
+    def _infer(cls, rows: Hypotheses, noise: Noise) -> Onsets:
         spans = _spans(rows)
         count, parts = len(spans), spans.shape[1]
         each = torch.arange(count).repeat_interleave(parts)
-        samples, weight, best, evidence = _explained(rows[each], spans.flatten(0, 1), noise)
+        samples, weight, best, evidence = _explain(rows[each], spans.flatten(0, 1), noise)
         first, last = rows.onsets.unbind(dim=1)
         all_onsets = (last - first + 1).double()
         weight = weight - all_onsets.log()[each, None]
@@ -111,11 +109,17 @@ def _cells(samples: Tensor) -> Tensor:
     return half.clamp_min(1e-9)
 
 
-def _explained(
-    rows: Hypotheses, limits: Tensor, noise: Noise
+def _explain(
+    rows: Hypotheses, limits: Tensor, noise: Noise, *, passes: int = 2
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Onsets (R, G) between limits, the log evidence of each times its cell; the best of them (R,),
     and its log evidence.
+
+    Parameters
+    ----------
+    passes : int, default 2
+        Times that the outputs are explained for the best onset.
+
     """
     first, last = (each[:, None] for each in limits.unbind(dim=1))
     empty = last < first
@@ -124,7 +128,7 @@ def _explained(
     samples = coarse = (first + (last - first) * share).round().long()
     x = rows.start
     objective = _objectives(rows, samples, x, None, noise)
-    for _ in range(PASSES):
+    for _ in range(passes):
         at = objective.argmin(dim=1, keepdim=True)
         best = samples.gather(1, at)
         problem = rows.held(best[:, 0]).problem

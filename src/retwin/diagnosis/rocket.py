@@ -37,8 +37,6 @@ KERNEL_LENGTH = 9
 PENALTIES = np.logspace(-1, 5, 13)
 """Penalties of the ridge among which leave-one-out chooses."""
 
-ABSENT = -2.0
-"""Score of a class that has no training example; scores of the others are near -1 and 1."""
 
 PARAMETERS = ("channels_per_kernel", "channels", "dilations", "per_dilation", "biases")
 """Fitted parameters of sktime's transform, in its order."""
@@ -106,11 +104,11 @@ class Rocket:
         before = Standardise(features.width)
         learnt = before.fit(features(fitted_on))(features(fitted_on))
         transform = _minirocket(self.kernels, task.seed, _channels(learnt))
-        convolved = _convolved(transform, learnt)
+        convolved = _convolve(transform, learnt)
         if progress is not None:
             progress(0.4)
         slope, level = _ridge(convolved, fitted_on.labels, order)
-        scores = _convolved(transform, before(features(held_out))) @ slope.T + level
+        scores = _convolve(transform, before(features(held_out))) @ slope.T + level
         truth = class_index(held_out, order).numpy()
         temperature, log_loss = _temperature(scores, truth)
         weights = {
@@ -176,7 +174,7 @@ class RocketDiagnoser:
             got=f"{standard.shape[1]} samples",
             remedy="cut or pad them to that length",
         )
-        convolved = _convolved(self._transform, standard)
+        convolved = _convolve(self._transform, standard)
         slope, level = (self.weights[name].double().numpy() for name in ("slope", "level"))
         found: NDArray = softmax(convolved @ slope.T + level, axis=1)
         # The comparison of a convolution with a bias is finite even where a channel is not.
@@ -204,8 +202,17 @@ class RocketDiagnoser:
         return cls(features, names, about["samples"], weights, about["figures"])
 
 
-def _ridge(convolved: NDArray, labels: NDArray, order: tuple[str, ...]) -> tuple[NDArray, NDArray]:
-    """Slope (classes, kernels) and level (classes,) of the scores of the classes in `order`."""
+def _ridge(
+    convolved: NDArray, labels: NDArray, order: tuple[str, ...], *, absent: float = -2.0
+) -> tuple[NDArray, NDArray]:
+    """Slope (classes, kernels) and level (classes,) of the scores of the classes in `order`.
+
+    Parameters
+    ----------
+    absent : float, default -2.0
+        Score of a class that has no training example; scores of the others are near -1 and 1.
+
+    """
     from sklearn.linear_model import RidgeCV
     from sklearn.preprocessing import StandardScaler
 
@@ -213,7 +220,7 @@ def _ridge(convolved: NDArray, labels: NDArray, order: tuple[str, ...]) -> tuple
     scaler = StandardScaler().fit(convolved)
     ridge = RidgeCV(alphas=PENALTIES).fit(scaler.transform(convolved), 2.0 * truth - 1)
     slope = ridge.coef_ / scaler.scale_
-    return slope, np.where(truth.any(axis=0), ridge.intercept_ - slope @ scaler.mean_, ABSENT)
+    return slope, np.where(truth.any(axis=0), ridge.intercept_ - slope @ scaler.mean_, absent)
 
 
 def _temperature(scores: NDArray, truth: NDArray) -> tuple[float, float]:
@@ -241,7 +248,7 @@ def _channels(standard: Tensor) -> NDArray:
     return torch.cat([standard, sums], dim=2).transpose(1, 2).contiguous().numpy()
 
 
-def _convolved(transform: Any, standard: Tensor) -> NDArray:
+def _convolve(transform: Any, standard: Tensor) -> NDArray:
     """The share of samples (n, kernels) at which each convolution is above its bias."""
     # When numba starts its threads, it raises the number of torch's to that of the cores.
     with threadpool_limits(limits=1):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from retwin.checks import require
+from retwin.checks import nothing, require
 from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.adaptive_grid import Integral
 from retwin.diagnosis.estimate import Estimate, ImplausibleError
@@ -34,8 +34,6 @@ __all__ = ["StateDiagnosis", "StateInversionDiagnoser"]
 
 UNEXPLAINED = "larger noise than in calibration explains the outputs better than every class"
 """The reason for which a trajectory is unknown."""
-IMPLAUSIBLE = 1e6
-"""Error of a prediction, in standard deviations, from which on an output is no measurement."""
 KINDS = tuple(kind for kind in FAULTS if issubclass(kind, TimedFault))
 """The faults that can be inverted."""
 
@@ -171,12 +169,12 @@ class StateInversionDiagnoser:
         """
         check_channels(self.twin, trajectories, "trajectories")
         empty = trajectories.ids[~trajectories.mask.any(axis=(1, 2))].tolist()
-        require(
-            not empty,
+        remedy = "leave them out"
+        nothing(
             "trajectories",
-            expected="measured samples in each",
-            got=f"none in {', '.join(empty[:5])}",
-            remedy="leave them out",
+            map("none in {}".format, empty),
+            "measured samples in each",
+            remedy=remedy,
         )
         found = []
         single = [trajectories[i : i + 1] for i in range(len(trajectories))]
@@ -207,11 +205,21 @@ class StateInversionDiagnoser:
             self.twin.outside(trajectories.commands),
         )
 
-    def _integrals(self, trajectory: Trajectories, known_start: bool) -> list[Integral]:
-        """Those of all faults for one trajectory, and of something else besides."""
+    def _integrals(
+        self, trajectory: Trajectories, known_start: bool, *, implausible: float = 1e6
+    ) -> list[Integral]:
+        """Those of all faults for one trajectory, and of something else besides.
+
+        Parameters
+        ----------
+        implausible : float, default 1e6
+            Error of a prediction, in standard deviations, from which on an output is no
+            measurement.
+
+        """
         record = FaultEvidence.of(self.twin, trajectory, known_start)
         error = record.largest_error()
-        if not error < IMPLAUSIBLE:
+        if not error < implausible:
             raise ImplausibleError(
                 "trajectories",
                 expected="finite outputs that the twin's sensors could measure",

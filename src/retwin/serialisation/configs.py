@@ -136,7 +136,7 @@ def from_settings(
     parameter names. Raises as `from_config` does.
     """
     model = _model(kind, tuple(kinds))  # type: ignore[arg-type]
-    made = _validated(model, settings, place)
+    made = _validate(model, settings, place)
     with at(place):
         return kind(**made)
 
@@ -153,7 +153,7 @@ def checked(
     Raises InputError for unknown parameters, for those named in `besides`, and for values of
     another type. The message names `place` and the key.
     """
-    return _validated(_model(kind, (), tuple(besides)), settings, place)
+    return _validate(_model(kind, (), tuple(besides)), settings, place)
 
 
 def key(place: str, name: str) -> str:
@@ -185,7 +185,7 @@ def _is_protocol(hint: Any) -> bool:
     return getattr(hint, "_is_protocol", False)
 
 
-def _validated(model: type[BaseModel], settings: Any, place: str) -> dict[str, Any]:
+def _validate(model: type[BaseModel], settings: Any, place: str) -> dict[str, Any]:
     """The parameters of `model` that `settings` hold; InputError about the first bad key."""
     require(
         isinstance(settings, Mapping),

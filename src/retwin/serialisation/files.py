@@ -42,10 +42,6 @@ TEMPORARY = re.compile(
 """The name of a temporary file or folder of this machine."""
 FORMER = ".former"
 """The end of the name of a folder that is being replaced."""
-MAX_STEM = 128
-"""Bytes of a file's name that its temporary name holds; systems allow 255 in all."""
-BYTES_PER_JSON_BYTE = 16
-"""Memory that the values of a JSON text may take, in multiples of its size."""
 _count = itertools.count()
 
 
@@ -136,9 +132,16 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     return parse_json(path.read_bytes(), path.name)
 
 
-def parse_json(text: bytes, where: str) -> Any:
-    """The values of a JSON text; raises as `read_json` does, with `where` in the messages."""
-    Budget(where).take(BYTES_PER_JSON_BYTE * len(text))
+def parse_json(text: bytes, where: str, *, bytes_per_json_byte: int = 16) -> Any:
+    """The values of a JSON text; raises as `read_json` does, with `where` in the messages.
+
+    Parameters
+    ----------
+    bytes_per_json_byte : int, default 16
+        Memory that the values of a JSON text may take, in multiples of its size.
+
+    """
+    Budget(where).take(bytes_per_json_byte * len(text))
     try:
         return json.loads(text)
     except RecursionError:
@@ -233,7 +236,7 @@ def _move(part: Path, target: Path, *, replace: bool) -> None:
         shutil.rmtree(former, ignore_errors=True)
     others = {each.name for each in target.iterdir()} - {each.name for each in part.iterdir()}
     refuse_others(target, others)
-    if _exchanged(part, target):
+    if _exchange(part, target):
         return
     # A kill between the two steps leaves no folder of that name: `recover` puts the former back.
     former = part.with_name(f"{part.name}{FORMER}")
@@ -246,7 +249,7 @@ def _move(part: Path, target: Path, *, replace: bool) -> None:
     shutil.rmtree(former)
 
 
-def _exchanged(part: Path, target: Path) -> bool:
+def _exchange(part: Path, target: Path) -> bool:
     """Exchange the names of two folders in one step; False where the file system cannot."""
     if os.name != "posix":
         return False
@@ -266,10 +269,17 @@ def _remove(part: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def _beginning(target: Path) -> str:
-    """How the names of all temporary files for `target` on this machine begin."""
+def _beginning(target: Path, *, max_stem: int = 128) -> str:
+    """How the names of all temporary files for `target` on this machine begin.
+
+    Parameters
+    ----------
+    max_stem : int, default 128
+        Bytes of a file's name that its temporary name holds; systems allow 255 in all.
+
+    """
     stem = os.fsencode(target.stem)
-    short = target.stem if len(stem) <= MAX_STEM else hashlib.sha256(stem).hexdigest()
+    short = target.stem if len(stem) <= max_stem else hashlib.sha256(stem).hexdigest()
     return f".{short}-{MACHINE}-"
 
 
@@ -293,11 +303,11 @@ def _left_in(folder: Path) -> Iterator[Path]:
     """The temporary files and folders in `folder` whose process has ended."""
     for file in list(folder.iterdir()):
         found = TEMPORARY.fullmatch(file.name)
-        if found and _ended(int(found["process"]), found["token"]):
+        if found and _has_ended(int(found["process"]), found["token"]):
             yield file
 
 
-def _ended(process: int, token: str) -> bool:
+def _has_ended(process: int, token: str) -> bool:
     """Whether this machine has no such process; False where that cannot be tested."""
     if os.name != "posix":  # elsewhere signal 0 does not test whether a process exists
         return False

@@ -16,22 +16,25 @@ import numpy as np
 
 from retwin.serialisation.files import sha256
 
-MAX_DEPTH = 12
-"""Levels of nested objects; of deeper ones only the class counts, which ends cycles."""
 
-
-def identity(value: object) -> str:
+def identity(value: object, *, max_depth: int = 12) -> str:
     """The SHA-256 of an object: its class, settings, arrays, weights and the contents of its files.
 
     An object whose files name other files has a text `fingerprint` that depends on those. Functions
     and classes count by their names. Pickle is not used, since its bytes depend on which parts are
     the same object, and not on the contents of files.
+
+    Parameters
+    ----------
+    max_depth : int, default 12
+        Levels of nested objects; of deeper ones only the class counts, which ends cycles.
+
     """
-    text = json.dumps(_described(value, MAX_DEPTH), sort_keys=True)
+    text = json.dumps(_describe(value, max_depth), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _described(value: Any, depth: int) -> Any:
+def _describe(value: Any, depth: int) -> Any:
     """`value` as JSON."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -46,13 +49,13 @@ def _described(value: Any, depth: int) -> Any:
     if depth == 0:
         return _kind(value)
     if isinstance(value, Mapping):
-        return [[str(key), _described(each, depth - 1)] for key, each in value.items()]
+        return [[str(key), _describe(each, depth - 1)] for key, each in value.items()]
     if isinstance(value, list | tuple):
-        return [_described(each, depth - 1) for each in value]
+        return [_describe(each, depth - 1) for each in value]
     if hasattr(value, "__qualname__") and not isinstance(value, MethodType):  # function or class
         return f"{value.__module__}:{value.__qualname__}"
-    fingerprint = _described(getattr(value, "fingerprint", ""), 0)
-    return [_kind(value), _described(_contents(value), depth - 1), fingerprint]
+    fingerprint = _describe(getattr(value, "fingerprint", ""), 0)
+    return [_kind(value), _describe(_contents(value), depth - 1), fingerprint]
 
 
 def _contents(value: Any) -> Any:

@@ -107,12 +107,12 @@ def refusing(folder: str | Path, *, expected: str, remedy: str = REMEDY) -> Iter
     The block cannot allocate tensors that are larger than the free memory allows: a description
     states the sizes of networks before their weights are compared.
     """
-    with files.refusing(folder, expected=expected, remedy=remedy), _limited(str(folder)):
+    with files.refusing(folder, expected=expected, remedy=remedy), _limit_memory(str(folder)):
         yield
 
 
 @contextmanager
-def _limited(where: str) -> Iterator[None]:
+def _limit_memory(where: str) -> Iterator[None]:
     """Refuse to make tensors in the block that take more memory than there is."""
     from torch.utils._python_dispatch import TorchDispatchMode
 

@@ -77,7 +77,7 @@ def unwritable(target: Path, error: OSError) -> InputError:
     return InputError(
         "path",
         expected="a place that can be written",
-        got=f"{_shortened(target)} ({error.strerror or type(error).__name__})",
+        got=f"{_shorten(target)} ({error.strerror or type(error).__name__})",
         remedy="give another folder or name",
     )
 
@@ -122,7 +122,7 @@ def in_use(folder: str | os.PathLike[str]) -> Iterator[None]:
     if os.name != "posix":
         yield
         return
-    opened = _opened(Path(folder))
+    opened = _open(Path(folder))
     try:
         _lock(opened, folder)
         try:
@@ -156,7 +156,7 @@ def _lock(opened: int, folder: str | os.PathLike[str]) -> None:
         return  # the file system has no locks
 
 
-def _opened(folder: Path) -> int:
+def _open(folder: Path) -> int:
     """A descriptor of the folder, which is made if it is not there."""
     while True:
         folder.mkdir(parents=True, exist_ok=True)
@@ -175,6 +175,6 @@ def _try_to_write(target: Path) -> None:
         pass
 
 
-def _shortened(path: Path) -> str:
+def _shorten(path: Path) -> str:
     text = str(path)
     return text if len(text) <= 160 else f"{text[:159]}…"

@@ -140,7 +140,7 @@ def _from_module(
         raise _unknown(name, str(error)) from None
     # A class of twins satisfies the protocol too, although it is not a twin itself.
     if isinstance(found, type) or not isinstance(found, Twin):
-        if callable(found) and not _needs_no_arguments(found):
+        if callable(found) and not needs_no_arguments(found):
             return _of_function(name, found, inputs, outputs, rate)
         found = found() if callable(found) else found
     if not isinstance(found, Twin):
@@ -195,7 +195,7 @@ def _check_one_array(name: str, function: Callable[..., Any], inputs: Sequence[s
         return
 
 
-def _needs_no_arguments(function: Callable[..., Any]) -> bool:
+def needs_no_arguments(function: Callable[..., Any]) -> bool:
     """Whether it can be called without arguments: then it makes a twin."""
     try:
         inspect.signature(function).bind()

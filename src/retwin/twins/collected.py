@@ -106,7 +106,7 @@ class Collected:
         observed = self.observed[good]
         mask = np.arange(observed.shape[1])[:, None] < self.known[good, None, None]
         made = Trajectories(
-            commands=_kept(self.commands[good]),
+            commands=_keep(self.commands[good]),
             nominal=self.nominal[good],
             observed=observed,
             mask=np.broadcast_to(mask, observed.shape),
@@ -139,7 +139,7 @@ class Collected:
         return reasons
 
 
-def _kept(commands: NDArray) -> NDArray:
+def _keep(commands: NDArray) -> NDArray:
     """The commands, copied if the caller may change its own array afterwards."""
     frozen = not commands.flags.writeable and getattr(commands.base, "base", None) is None
     owner = commands if commands.base is None else commands.base

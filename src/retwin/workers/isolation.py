@@ -18,9 +18,6 @@ from retwin.workers.process import (
     Retired,
 )
 
-START_TIME = 120.0
-"""Duration in s after which a process that has not begun is ended. It is long, since a computer
-that is short of memory may need that long to import Python's packages."""
 OVERHEAD = 2**22
 """Bytes that an answer may take besides its arrays."""
 
@@ -83,11 +80,20 @@ class IsolatedPool:
         for process in list(self._all):
             process.end()
 
-    def _ask(self, task: tuple[Any, ...], timeout: float, size: int) -> Frame:
+    def _ask(
+        self, task: tuple[Any, ...], timeout: float, size: int, *, start_time: float = 120.0
+    ) -> Frame:
         """Have a task done by this thread's process.
 
         A process that retires is replaced, and so is one that ends during a task that was not its
         first: the outcome must not depend on what a process did before.
+
+        Parameters
+        ----------
+        start_time : float, default 120.0
+            Duration in s after which a process that has not begun is ended. It is long, since a
+            computer that is short of memory may need that long to import Python's packages.
+
         """
         while True:
             process: ForeignProcess | None = getattr(self._own, "process", None)
@@ -98,7 +104,7 @@ class IsolatedPool:
                     self._all.add(process)
                     if self._closed:  # after `close` has killed the others
                         process.kill()
-                    _one(process, self._begin, START_TIME, 0)
+                    _one(process, self._begin, start_time, 0)
                 return _one(process, task, timeout, size)
             except BaseException as error:
                 if process is not None:

@@ -36,8 +36,6 @@ MARK = b"rtw\n"
 BYTES_PER_CHARACTER, BYTES_PER_FLOAT = 32, 8
 """The largest size in memory of what one character of a frame's text describes, and of a whole
 number, which may become a float."""
-CLOSING_TIME = 1.0
-"""Duration in s that a process has to end after it has closed its connection."""
 MORE_TIME = 8
 """How often the time limit of a task may begin anew, so that a process that writes what reads as
 such a message still ends."""
@@ -185,10 +183,17 @@ class ForeignProcess:
         timer.start()
         return timer
 
-    def _describe_end(self) -> ProcessEnded:
-        """How the process ended, which has closed its connection."""
+    def _describe_end(self, *, closing_time: float = 1.0) -> ProcessEnded:
+        """How the process ended, which has closed its connection.
+
+        Parameters
+        ----------
+        closing_time : float, default 1.0
+            Duration in s that a process has to end after it has closed its connection.
+
+        """
         try:
-            code = self._process.wait(CLOSING_TIME)
+            code = self._process.wait(closing_time)
         except subprocess.TimeoutExpired:
             return ProcessEnded("it closed the connection of its process")
         how = f"died (signal {-code})" if code < 0 else f"ended (exit code {code})"

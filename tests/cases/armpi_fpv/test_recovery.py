@@ -196,6 +196,7 @@ def test_real_paths_are_explained() -> None:
     assert ((found.onsets[:, 0] >= 0) & (found.onsets[:, 0] <= 10)).all()
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.real_data
 def test_simulated_paths_are_explained() -> None:

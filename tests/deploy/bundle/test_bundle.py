@@ -22,6 +22,8 @@ from retwin.deploy.bundle.seal import SUMS, read_sealed, seal, verify_seal
 from retwin.serialisation.files import sha256
 from retwin.twins.commands.samplers import RampSampler
 
+pytestmark = pytest.mark.slow
+
 Call = Callable[..., tuple[int, str, str]]
 
 BRIEF = settings(

@@ -256,6 +256,7 @@ def test_on_a_cluster_with_a_worker_killed(tmp_path: Path, whole: dict[str, Any]
     assert result.failed
 
 
+@pytest.mark.slow
 def test_a_worker_process_that_dies_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "calls").mkdir()
     deadly = Deadly(str(tmp_path / "calls"))
@@ -337,6 +338,7 @@ def test_killed_at_the_end(
     assert os.listdir(tmp_path) == ["a.zarr"]
 
 
+@pytest.mark.slow
 def test_a_finished_folder_is_not_made_again(tmp_path: Path, whole: dict[str, Any]) -> None:
     first = simulate_to(tmp_path / "a.zarr", whole["plan"])
     before = calls(clean(whole))
@@ -600,6 +602,7 @@ def test_what_a_twin_raises_tells_where(
     assert (tmp_path / "a.zarr.part").exists(), "it may go on when the twin is mended"
 
 
+@pytest.mark.slow
 def test_bad_places_and_calls(tmp_path: Path) -> None:
     def refused(match: str, name: str, **options: Any) -> None:
         with pytest.raises(rt.InputError, match=match) as caught:

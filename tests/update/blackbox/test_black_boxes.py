@@ -21,6 +21,8 @@ from retwin.update import (
 )
 from retwin.update.blackbox.narx import forward
 
+pytestmark = pytest.mark.slow
+
 RATE = 10.0
 NOISE = 0.01
 SETTLED = 40

@@ -219,6 +219,7 @@ def test_intervals_of_delays_cover(understood: dict) -> None:
     assert understood["delay deviation"].mean() < 0.5 * understood["delay"].std()
 
 
+@pytest.mark.slow
 def test_what_the_outputs_do_not_tell_is_said(exact, commands: np.ndarray) -> None:
     """Three outputs, four joints: not all offsets of the planar joints can be known."""
     context = context_of(exact, commands)
@@ -234,6 +235,7 @@ def test_what_the_outputs_do_not_tell_is_said(exact, commands: np.ndarray) -> No
     assert deviation[..., 4].median() > 3 * deviation[..., 1].median()
 
 
+@pytest.mark.slow
 def test_a_fault_does_not_pass_for_a_discrepancy(exact, commands: np.ndarray) -> None:
     """The bias of a faulty motor is its severity, and leaves the offsets alone."""
     faults = [rt.ActuatorBias(0, bias=(30.0, -20.0, 40.0, -35.0, 25.0)), *[None] * 11]

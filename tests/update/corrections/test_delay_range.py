@@ -70,6 +70,7 @@ def test_the_range_holds_the_delays_at_any_rate(rate: float, delay: float) -> No
     assert high - low <= rate * (3 * delay + 0.2) + 4, "no wider than is needed"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("operator", OPERATORS)
 @pytest.mark.parametrize("rate", [100.0, 500.0])
 @pytest.mark.parametrize("delay", [0.03, 0.12, 0.3])
@@ -83,6 +84,7 @@ def test_delays_are_found_at_any_rate(operator: type, rate: float, delay: float)
     assert error < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("operator", OPERATORS)
 def test_a_range_that_ends_too_soon_is_said(operator: type) -> None:
     context, outputs = measured(500.0, 0.12)
@@ -93,6 +95,7 @@ def test_a_range_that_ends_too_soon_is_said(operator: type) -> None:
     assert not found.identified[..., 0][found.at_bound].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("operator", OPERATORS)
 def test_a_fitted_operator_holds_numbers(operator: type) -> None:
     context, outputs = measured(500.0, 0.12)

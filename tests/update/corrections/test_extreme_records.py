@@ -84,6 +84,7 @@ def test_units_of_a_twin_in_place_of_a_surrogate_do_not_matter(operator: type) -
     torch.testing.assert_close(other[..., :3], one[..., :3], rtol=0.35, atol=0)
 
 
+@pytest.mark.slow
 def test_outputs_that_never_change_identify_no_delay() -> None:
     context, _, outputs = measured(Plane(), commands_of(5))
     found = rt.CommandSpace().infer(context, 0 * outputs + 1, torch.ones(outputs.shape).bool())
@@ -129,6 +130,7 @@ def test_intervals_of_rounded_outputs_cover(operator: type, noise: float) -> Non
     assert deviation[..., 1:3].max() < step, "no wider than what rounding leaves"
 
 
+@pytest.mark.slow
 def test_few_samples_do_not_pass_for_exact_ones() -> None:
     """With hardly more measured values than components of z, residuals are z's, not the noise."""
     context, z, outputs = measured(Plane(), commands_of(12), noise=0.02)
@@ -144,6 +146,7 @@ def test_few_samples_do_not_pass_for_exact_ones() -> None:
     assert scales[1] > 0.8 * scales[0]
 
 
+@pytest.mark.slow
 def test_delays_that_no_output_shows_stay_within_their_range() -> None:
     """A machine that stands still: the common delay has no likelihood, but limits."""
     sampler = rt.twins.RampSampler((-1, -1), (1, 1), RATE, 8.0, segments=1)
@@ -186,6 +189,7 @@ def test_intervals_of_exact_outputs_cover(seed: int) -> None:
     assert (found.z - z)[known].abs().max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "share"), [(0.05, (0.8, 1.0)), (1.0, (0.0, 0.4)), (4.0, (0, 0))])
 def test_delays_that_noise_could_have_made_are_not_identified(
     noise: float, share: tuple[float, float]

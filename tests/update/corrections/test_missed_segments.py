@@ -42,6 +42,7 @@ def ways(context: rt.Context, missed: NDArray) -> NDArray:
     return np.stack(made, axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missed", [0.0, 0.1, 0.5, 0.8, 0.95, 1.0, None])
 def test_missed_segments_are_found_however_many(missed: float | None) -> None:
     """Offsets that undo all motions would explain outputs as well, were they what is common."""
@@ -77,6 +78,7 @@ def test_missed_segments_do_not_widen_the_range_of_delays(missed: float) -> None
         assert -10 <= low < 4 < high <= 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_range_much_too_wide_for_a_machine_that_hardly_moves(seed: int) -> None:
     """Delays of segments that were missed have no likelihood; steps along them end anywhere."""

@@ -25,6 +25,8 @@ from retwin.update.dynamics.estimation import correlation_time
 from retwin.update.dynamics.noise import needed_factor
 from retwin.update.dynamics.prediction import Prediction, log_density
 
+pytestmark = pytest.mark.slow
+
 FORCE = rt.Channels(("force",), ("N",))
 POSITION = rt.Channels(("position",), ("m",))
 STIFFNESS = Parameter("stiffness", "N/m", 10.0, 100.0, 40.0)

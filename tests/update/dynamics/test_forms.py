@@ -22,6 +22,8 @@ from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.noise import edges
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 
+pytestmark = pytest.mark.slow
+
 RATE, NOISE = 40.0, 1e-3
 STIFFNESS = Parameter("stiffness", "N/m", 10.0, 100.0, 40.0)
 DAMPING = Parameter("damping", "N s/m", 0.05, 5.0, 0.6)

@@ -93,6 +93,7 @@ def test_a_cube_needs_no_hinges() -> None:
         assert abs(found.parameters[name] / value - 1) < 4 * found.errors[name] / value < 0.02
 
 
+@pytest.mark.slow
 def test_the_assumed_error_of_an_exact_twin_is_that_of_its_outputs() -> None:
     """With 0.6 of it, standard errors were a fifth too small."""
     found = fitted(motor(), -6.0, np.random.default_rng(1))

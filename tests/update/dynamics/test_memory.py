@@ -97,6 +97,7 @@ def test_a_twin_that_lacks_nothing_gets_no_memory() -> None:
     assert [each.name for each in found.twin.equations.states] == ["air"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["derivative", "step"])
 def test_memories_without_weight_do_not_act_on_each_other(kind: str) -> None:
     """Their effects on the outputs are those that each has alone."""

@@ -11,6 +11,8 @@ from retwin.twins import Parameter, State, StateTwin
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
 from retwin.update.training_range import OutsideTrainingWarning
 
+pytestmark = pytest.mark.slow
+
 INPUT = rt.Channels(("u",), ("V",))
 OUTPUT = rt.Channels(("y",), ("m",))
 STATE = State("x", "m")

@@ -83,6 +83,7 @@ def share_inside(count: int, kind: str, loss: Loss, seeds: int) -> float:
     return float(np.mean(inside))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sample", "trajectory"])
 def test_intervals_hold_the_truth_as_often_as_they_should(kind: str) -> None:
     """Of 60 intervals at least 50: with independent ones that fails once in 10,000 times."""
@@ -168,6 +169,7 @@ def test_values_that_depend_on_a_bound_are_not_identified() -> None:
     assert not found.identifiability.identified[1]
 
 
+@pytest.mark.slow
 def test_a_true_value_on_a_bound_leaves_the_others_identified() -> None:
     narrow = parametric(lag, gain=(0.1, 1.0), share=(0.1, 0.98))
     depends = []
@@ -259,6 +261,7 @@ def test_the_updated_twin_keeps_the_contract(updated_twin: rt.Twin, check: Calla
     check(TwinSubject(updated_twin, commands(3, 40), faults))
 
 
+@pytest.mark.slow
 def test_delay_and_joint_offsets_of_the_emulated_robot(case: rt.Case) -> None:
     some = case.sampler.sample(6, rng=np.random.default_rng(0))
     hidden: dict[str, np.ndarray] = {}

@@ -65,6 +65,7 @@ def cart() -> rt.Trajectories:
     return in_closed_loop()
 
 
+@pytest.mark.slow
 def test_an_integrating_plant_is_fitted_in_windows(cart: rt.Trajectories) -> None:
     found = identify(CART.parametric(), cart, QUICK, seed=0)
     whole = identify(CART.parametric(), cart, QUICK, seed=0, horizon=np.inf)
@@ -74,6 +75,7 @@ def test_an_integrating_plant_is_fitted_in_windows(cart: rt.Trajectories) -> Non
     assert found.horizons[0].error < next(e.error for e in found.horizons if e.length is None)
 
 
+@pytest.mark.slow
 def test_the_page_has_the_error_of_predictions_and_of_the_mean(cart: rt.Trajectories) -> None:
     used, held_out = hold_out(cart, 0.25, seed=0)
     before = CART.parametric()
@@ -99,6 +101,7 @@ def test_derivatives_are_those_of_the_misfit_whose_starts_follow(cart: rt.Trajec
     assert gradient == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_an_unstable_plant_is_fitted_although_its_free_simulation_fails() -> None:
     def derivative(x, u, p):
         return (x.velocity, p.gain * u.u + 9.0 * x.position)

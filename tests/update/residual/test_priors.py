@@ -48,6 +48,7 @@ def test_machines_that_differ_are_wide() -> None:
     assert deviation(differ) > 3 * deviation([machine(1.0, 1.0)] * 12) / 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("between", [0.3, 1.0, 4.0])
 def test_a_further_machine_is_as_far_away_as_predicted(between: float) -> None:
     """Of a known hierarchy, 90 % intervals of a further machine hold 90 %."""
@@ -110,6 +111,7 @@ def good() -> rt.ResidualModel:
     return fitted(4, 0.1, 0)
 
 
+@pytest.mark.slow
 def test_models_of_other_machines_are_the_prior(good, tmp_path: Path) -> None:
     """A folder or a model, or several; the record states from how many machines it came."""
     assert good.learned["offset"][0][0] == pytest.approx(0.1, abs=0.03)

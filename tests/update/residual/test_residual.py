@@ -233,6 +233,7 @@ def test_a_flow_starts_as_a_normal_distribution_in_any_unit() -> None:
     torch.testing.assert_close(drawn.variance[0].detach().sqrt(), scale, atol=0, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_draws_follow_the_distribution_and_the_bounds(
     fitted: dict[int, rt.ResidualModel], identity: rt.Surrogate
 ) -> None:
@@ -302,6 +303,7 @@ def test_draws_from_noise_have_the_mixture_s_moments() -> None:
     assert torch.equal(drawn, again)
 
 
+@pytest.mark.slow
 def test_calibrates_on_healthy_by_default(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
     brief, half = rt.Mixture(training=Training(max_epochs=3, batch_size=64)), emulated[::2]
     few = rt.fit_residual(ibg, half, density=brief, seed=0)
@@ -311,6 +313,7 @@ def test_calibrates_on_healthy_by_default(ibg: rt.Surrogate, emulated: rt.Trajec
     assert every.scale[1:].max() > 1.5 * few.scale[1:].max(), "the offset absorbs the faults"
 
 
+@pytest.mark.slow
 def test_six_healthy_trajectories_are_enough(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
     model = rt.fit_residual(ibg, emulated.with_label("Healthy")[:6], seed=0)
     context, _ = rt.infer_discrepancy(ibg, emulated.with_label("Healthy"), rt.DelayOffset())
@@ -441,6 +444,7 @@ def test_refinement_helps_a_poor_model_on_trajectories_it_never_saw(
     assert scores[0] - scores[1] > 0.15
 
 
+@pytest.mark.slow
 def test_refinement_that_does_not_help_changes_nothing(identity: rt.Surrogate) -> None:
     calibration, _ = toy(30, seed=6)
     wild = rt.Refinement(

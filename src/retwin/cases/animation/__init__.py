@@ -101,7 +101,7 @@ def animate(
     body = given(
         "case", case.body, "a case with a body, which can be drawn", got=got, remedy=remedy
     )
-    one = _chosen(trajectories, case, index)
+    one = _choose(trajectories, case, index)
     one = case.complete(one)
     shots, chart = _shots(one, body, fps), None
     if updated is not None:
@@ -170,14 +170,11 @@ def _check(fps: float, size: tuple[int, int], renderer: str, *, least: tuple[int
     one_of("renderer", renderer, get_args(Renderer), remedy="leave it out to have one chosen")
 
 
-def _chosen(trajectories: Trajectories, case: Case, index: int | str) -> Trajectories:
+def _choose(trajectories: Trajectories, case: Case, index: int | str) -> Trajectories:
     """The one trajectory at `index`."""
-    require(
-        trajectories.outputs == case.outputs,
-        "trajectories",
-        expected=f"outputs {list(case.outputs.names)}, as the case {case.name} has",
-        got=list(trajectories.outputs.names),
-        remedy="give the case that the data belong to",
+    remedy = "give the case that the data belong to"
+    agree(
+        "trajectories", trajectories, case, "those of the case", names=("outputs",), remedy=remedy
     )
     ids = trajectories.ids.tolist()
     expected = f"a position from 0 to {len(ids) - 1}" if ids else "a set that is not empty"

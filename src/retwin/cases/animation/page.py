@@ -25,8 +25,6 @@ DPI = 100
 """Pixels per inch, by which matplotlib converts sizes."""
 VEIL = 0.88
 """Opacity of the veil over what is not yet reached, from 0 to 1."""
-WIDE = 1.5
-"""Ratio of width to height from which on the chart is beside the picture and not below it."""
 INK, MUTED, ALARM = "#1b1f24", "#5a636e", "#8f2d00"
 
 
@@ -53,13 +51,20 @@ class Chart:
     drawn: NDArray
 
 
-def picture_size(size: tuple[int, int], *, chart: bool) -> tuple[int, int]:
-    """Width and height in pixels of the picture in a film, which the chart leaves for it."""
+def picture_size(size: tuple[int, int], *, chart: bool, wide: float = 1.5) -> tuple[int, int]:
+    """Width and height in pixels of the picture in a film, which the chart leaves for it.
+
+    Parameters
+    ----------
+    wide : float, default 1.5
+        Ratio of width to height from which on the chart is beside the picture and not below it.
+
+    """
     width, height = size
     if not chart:
         return size
     return (
-        (round(0.45 * width), height) if width >= WIDE * height else (width, round(0.66 * height))
+        (round(0.45 * width), height) if width >= wide * height else (width, round(0.66 * height))
     )
 
 

@@ -17,8 +17,6 @@ UPDATED = (0.00, 0.53, 0.37)
 PAPER = (0.97, 0.975, 0.98)
 RING = (0.79, 0.81, 0.84)
 """Colours of the nominal motion, the observed one, the updated twin, background and rings."""
-TRAIL = 1.0
-"""Seconds of its past path that a draw of the updated twin shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +52,16 @@ class Shots:
     def __len__(self) -> int:
         return len(self.seconds)
 
-    def trails(self, frame: int) -> NDArray:
-        """The paths (draws, frames, 3) of the draws that lead to a frame."""
-        past = np.searchsorted(self.seconds, self.seconds[frame] - TRAIL - 1e-9)
+    def trails(self, frame: int, *, trail: float = 1.0) -> NDArray:
+        """The paths (draws, frames, 3) of the draws that lead to a frame.
+
+        Parameters
+        ----------
+        trail : float, default 1.0
+            Seconds of its past path that a draw of the updated twin shows.
+
+        """
+        past = np.searchsorted(self.seconds, self.seconds[frame] - trail - 1e-9)
         return self.drawn[:, past : frame + 1]
 
     @property

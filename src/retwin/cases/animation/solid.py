@@ -30,14 +30,10 @@ if TYPE_CHECKING:
 
 BACKENDS = ("egl", "osmesa")
 """Backends that draw without a screen, tried in this order unless MUJOCO_GL names one."""
-FRAMES_PER_TASK = 10
-"""Number of frames per task: enough to hide the transfer, few enough to show progress."""
 TIMEOUT = 120.0
 """Duration in s after which a task is ended as hung; software rendering is slow."""
 BROKEN = (RuntimeError, ProcessExpired, TimeoutError)
 """Errors of a worker that cannot draw."""
-GHOST_OPACITY = 0.6
-"""Opacity of the ghost, from 0 to 1."""
 
 
 @contextmanager
@@ -112,11 +108,20 @@ class _Stage:
     camera: Camera
 
 
-def _pictures(pool: ProcessPool, stage: _Stage, shots: Shots) -> Iterator[NDArray]:
-    """The pictures, some frames at a time."""
+def _pictures(
+    pool: ProcessPool, stage: _Stage, shots: Shots, *, frames_per_task: int = 10
+) -> Iterator[NDArray]:
+    """The pictures, some frames at a time.
+
+    Parameters
+    ----------
+    frames_per_task : int, default 10
+        Number of frames per task: enough to hide the transfer, few enough to show progress.
+
+    """
     poses = np.stack([shots.nominal, shots.observed], axis=1)
-    for first in range(0, len(shots), FRAMES_PER_TASK):
-        some = poses[first : first + FRAMES_PER_TASK]
+    for first in range(0, len(shots), frames_per_task):
+        some = poses[first : first + frames_per_task]
         yield from pool.schedule(_draw, (stage, some), timeout=TIMEOUT).result()
 
 
@@ -151,7 +156,7 @@ class _Scene:
 
         self._mujoco = mujoco
         try:
-            self._model = _compiled(stage)
+            self._model = _compile(stage)
             self._addresses = [self._model.joint(name).qposadr[0] for name in stage.joints]
         except (ValueError, KeyError) as error:
             raise InputError(
@@ -174,13 +179,22 @@ class _Scene:
         self._ghost[0][own, :3] = GHOST
         mujoco.mj_forward(self._model, self._data)  # places the lights
 
-    def picture(self, nominal: NDArray, observed: NDArray) -> NDArray:
-        """The picture (height, width, 4) of nominal and observed joints in rad or m."""
+    def picture(
+        self, nominal: NDArray, observed: NDArray, *, ghost_opacity: float = 0.6
+    ) -> NDArray:
+        """The picture (height, width, 4) of nominal and observed joints in rad or m.
+
+        Parameters
+        ----------
+        ghost_opacity : float, default 0.6
+            Opacity of the ghost, from 0 to 1.
+
+        """
         # The ghost is behind the solid body: two surfaces in one place would flicker.
         ghost, solid = self._render(nominal, self._ghost), self._render(observed, self._solid)
         paper = np.round(255 * np.array(PAPER))
         behind, there = (np.abs(each - paper).max(axis=2) > 2 for each in (ghost, solid))
-        opacity = np.where(there, 1, GHOST_OPACITY * behind)
+        opacity = np.where(there, 1, ghost_opacity * behind)
         colour = np.where(there[..., None], solid, ghost)
         return np.concatenate([colour, 255 * opacity[..., None]], axis=2).astype(np.uint8)
 
@@ -194,7 +208,7 @@ class _Scene:
         return self._renderer.render()
 
 
-def _compiled(stage: _Stage) -> Any:
+def _compile(stage: _Stage) -> Any:
     """The model on light paper."""
     import mujoco
 

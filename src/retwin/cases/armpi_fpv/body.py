@@ -27,12 +27,6 @@ COMMAND_WEIGHT = 5e-4
 It is so small that the end-effector is met to a few µm. Near the straight pose, where the yaw
 hardly affects the end-effector, it keeps the yaw at its command.
 """
-GAUSS_NEWTON_STEPS = 8
-"""Number of damped Gauss-Newton steps per sample; they suffice since each sample starts at the
-pose of the sample before."""
-SWITCH_RATIO = 0.5
-"""Ratio of costs below which the pose found from the command replaces the one that continues the
-motion. Without this margin the picture would flicker between two poses of similar cost."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +81,7 @@ class ArmBody:
                 remedy="load the file with the arm's case, which completes commands",
             )
         nominal = self.twin.angles(trajectories.commands.astype(float))
-        return nominal, nearest_poses(self.twin.arm, nominal, _interpolated(trajectories))
+        return nominal, nearest_poses(self.twin.arm, nominal, _interpolate(trajectories))
 
     def skeleton(self, joints: NDArray) -> NDArray:
         """Ground, shoulder, elbow, wrist and end-effector.
@@ -111,7 +105,9 @@ class ArmBody:
         return np.stack(points, axis=-2)
 
 
-def nearest_poses(arm: YawPitchArm, commanded: NDArray, tip: NDArray) -> NDArray:
+def nearest_poses(
+    arm: YawPitchArm, commanded: NDArray, tip: NDArray, *, switch_ratio: float = 0.5
+) -> NDArray:
     """Poses that put the end-effector at given positions and are nearest to the commanded poses.
 
     Parameters
@@ -122,6 +118,9 @@ def nearest_poses(arm: YawPitchArm, commanded: NDArray, tip: NDArray) -> NDArray
         Commanded joint angles in rad.
     tip : ndarray, shape (n, T, 3)
         End-effector positions in m.
+    switch_ratio : float, default 0.5
+        Ratio of costs below which the pose found from the command replaces the one that continues
+        the motion. Without this margin the picture would flicker between two poses of similar cost.
 
     Returns
     -------
@@ -141,15 +140,28 @@ def nearest_poses(arm: YawPitchArm, commanded: NDArray, tip: NDArray) -> NDArray
     for t in range(commanded.shape[1]):
         goal = commanded[:, t]
         found, cost = _descend(arm, np.stack([before, goal]), goal, tip[:, t])
-        before = found[(cost[1] < SWITCH_RATIO * cost[0]).astype(int), chosen]
+        before = found[(cost[1] < switch_ratio * cost[0]).astype(int), chosen]
         out[:, t] = before
     return out
 
 
 def _descend(
-    arm: YawPitchArm, start: NDArray, commanded: NDArray, tip: NDArray
+    arm: YawPitchArm,
+    start: NDArray,
+    commanded: NDArray,
+    tip: NDArray,
+    *,
+    gauss_newton_steps: int = 8,
 ) -> tuple[NDArray, NDArray]:
-    """Poses (..., joints) and their cost (...) by damped Gauss-Newton from `start`."""
+    """Poses (..., joints) and their cost (...) by damped Gauss-Newton from `start`.
+
+    Parameters
+    ----------
+    gauss_newton_steps : int, default 8
+        Number of damped Gauss-Newton steps per sample; they suffice since each sample starts at the
+        pose of the sample before.
+
+    """
     stay = np.broadcast_to(COMMAND_WEIGHT * np.eye(arm.joints), (*start.shape, arm.joints))
 
     def evaluate(pose: NDArray) -> tuple[NDArray, NDArray]:
@@ -157,10 +169,10 @@ def _descend(
         error = np.concatenate([arm.position(pose) - tip, deviation], axis=-1)
         return error, np.concatenate([arm.jacobian(pose), stay], axis=-2)
 
-    return gauss_newton(evaluate, start, rounds=GAUSS_NEWTON_STEPS)
+    return gauss_newton(evaluate, start, rounds=gauss_newton_steps)
 
 
-def _interpolated(trajectories: Trajectories) -> NDArray:
+def _interpolate(trajectories: Trajectories) -> NDArray:
     """The measured path (n, T, 3), interpolated; nominal where a channel was never measured."""
     path = trajectories.observed.astype(float)
     time = np.arange(trajectories.steps)

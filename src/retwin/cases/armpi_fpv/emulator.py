@@ -177,7 +177,7 @@ class EmulatedArmPi(TwinWrapper):
         constant = self.bias * rng.normal(size=(len(segments), 1, len(self.inputs)))
         offset = self.offset * rng.standard_t(8, size=joints)
         if self.repeatable:
-            same = _repeating(chunk.commands, segments) * self.offset * math.sqrt(8 / 6)
+            same = _repeat_errors(chunk.commands, segments) * self.offset * math.sqrt(8 / 6)
             share = self.repeatable
             offset = math.sqrt(1 - share) * offset + math.sqrt(share) * same
         return {
@@ -208,7 +208,7 @@ class EmulatedArmPi(TwinWrapper):
         return interpolated(samples, np.maximum(np.arange(steps) - first, 0), every)
 
 
-def _repeating(commands: NDArray, segments: Segments) -> NDArray:
+def _repeat_errors(commands: NDArray, segments: Segments) -> NDArray:
     """Errors (n, M, d_u) that the pose and the direction of travel determine, of unit size."""
     first, last = (
         np.stack([interpolated(*pair) for pair in zip(commands, at, strict=True)])

@@ -13,25 +13,19 @@ from retwin.twins.commands.ramps import ramps_and_holds
 
 HALF_TURN = TURN // 2
 """Command units in half a turn."""
-ROUNDING = 1.5e-6
-"""Error in m, above that of rounding the published paths to 1e-6 m per axis."""
-LARGEST_NOISE = 1e-4
-"""Distance in m between samples at rest above which it is not attributed to noise."""
 EXPLAINED = 5e-5
 """RMS error in m above which a movement counts as not explained."""
-SIMILAR = 2e-3
-"""RMS error in m above which a movement is not similar to one of this arm."""
-REGULARISATION = 1e-14
-"""Weight in m^2 of a straight yaw: far less than that of a single sample off the axis."""
 
 
-def path_noise(path: NDArray) -> NDArray:
+def path_noise(path: NDArray, *, largest_noise: float = 1e-4) -> NDArray:
     """Estimate the noise of paths.
 
     Parameters
     ----------
     path : ndarray, shape (n, T, 3)
         End-effector positions in m.
+    largest_noise : float, default 1e-4
+        Distance in m between samples at rest above which it is not attributed to noise.
 
     Returns
     -------
@@ -41,7 +35,7 @@ def path_noise(path: NDArray) -> NDArray:
     """
     speed = np.linalg.norm(np.diff(path, axis=1), axis=2)
     # The arm rests for at least a quarter of its paths.
-    return np.minimum(np.quantile(speed, 0.25, axis=1), LARGEST_NOISE)
+    return np.minimum(np.quantile(speed, 0.25, axis=1), largest_noise)
 
 
 def _hats(part: NDArray) -> NDArray:
@@ -132,8 +126,15 @@ class PathFit:
         near = self.closed & (np.abs(self.onsets - whole) < 0.1).all(axis=1)
         self.onsets = np.where(near[:, None], whole, self.onsets)
 
-    def solve(self) -> None:
-        """Fit commands and onsets, repeatedly and with more effort where that can help."""
+    def solve(self, *, similar: float = 0.002) -> None:
+        """Fit commands and onsets, repeatedly and with more effort where that can help.
+
+        Parameters
+        ----------
+        similar : float, default 0.002
+            RMS error in m above which a movement is not similar to one of this arm.
+
+        """
         some = np.arange(self.count)
         for effort in (1, 1, 2, 4):
             before = self.onsets
@@ -143,7 +144,7 @@ class PathFit:
             self.cost = self._per_movement(self.square)
             again = (self.cost > self.tolerance[:, None] ** 2).any(axis=1)
             # More effort does not help where no movement is similar to one of this arm.
-            again &= (self.cost < SIMILAR**2).any(axis=1)
+            again &= (self.cost < similar**2).any(axis=1)
             if effort == 1 and some.size == self.count:
                 # Commands depend on the onsets, and onsets on the commands.
                 again |= (np.abs(self.onsets - before) > 1e-9).any(axis=1)
@@ -169,12 +170,19 @@ class PathFit:
         """Mean (n, M) of values (n, T) from just before a movement to just after it."""
         return _means(values, np.maximum(self.first - 1, 0), np.minimum(self.last + 3, self.length))
 
-    def _rests(self) -> tuple[NDArray, NDArray]:
-        """Mean radius and height (n, M + 1, 2) of the rests in m, and their tolerance (n,)."""
+    def _rests(self, *, rounding: float = 1.5e-6) -> tuple[NDArray, NDArray]:
+        """Mean radius and height (n, M + 1, 2) of the rests in m, and their tolerance (n,).
+
+        Parameters
+        ----------
+        rounding : float, default 1.5e-6
+            Error in m, above that of rounding the published paths to 1e-6 m per axis.
+
+        """
         none = np.zeros((self.count, 1), dtype=int)
         low = np.concatenate([none, self.last + 1], axis=1)
         high = np.concatenate([self.first + 1, none + self.length], axis=1)
-        return _means(self.point, low, high), ROUNDING + path_noise(self.path)
+        return _means(self.point, low, high), rounding + path_noise(self.path)
 
     def _kinks(self) -> NDArray:
         """Where the path has the kink at the end of a ramp (n, M, 3), well above the tolerance."""
@@ -229,8 +237,17 @@ class PathFit:
         fit = design @ (np.linalg.pinv(design) @ target)
         return ((target - fit) ** 2).mean(axis=(3, 4)) * STEP**2
 
-    def _set_yaw(self, rows: NDArray, parts: NDArray, error: NDArray) -> None:
-        """Ramps and rests of the yaw motor, by weighted least squares over each path."""
+    def _set_yaw(
+        self, rows: NDArray, parts: NDArray, error: NDArray, *, regularisation: float = 1e-14
+    ) -> None:
+        """Ramps and rests of the yaw motor, by weighted least squares over each path.
+
+        Parameters
+        ----------
+        regularisation : float, default 1e-14
+            Weight in m^2 of a straight yaw: far less than that of a single sample off the axis.
+
+        """
         parts, error, weight, angle = parts[rows], error[rows], self.weight[rows], self.angle[rows]
         length = np.argmin(error, axis=2)
         hats = _hats(np.take_along_axis(parts, length[..., None, None], axis=2)[:, :, 0])
@@ -243,7 +260,7 @@ class PathFit:
         matrix = transposed @ design
         vector = transposed @ (root * angle[..., None]).reshape(rows.size, -1, 1)
         # Where the data do not determine the yaw, the regularisation makes it straight.
-        inverse = np.linalg.inv(matrix + REGULARISATION * np.eye(self.moves + 1))
+        inverse = np.linalg.inv(matrix + regularisation * np.eye(self.moves + 1))
         yaw = (inverse @ vector)[..., 0]
         if self.moves == 0:
             yaw[:, 0] = np.median(self.yaw[rows], axis=1) / STEP * self.determined[rows].any(axis=1)

@@ -22,8 +22,6 @@ TURN = 1500
 """Steps in a full turn."""
 LIMIT = 500
 """Largest angle of a motor to either side, in steps."""
-POSTURES_PER_REST = 24
-"""Largest number of postures that are kept per rest; usually one or two are found."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +121,9 @@ def bends(
     return low, bend(near)
 
 
-def grid_postures(plane: Plane, paths: NDArray, rest: int) -> tuple[NDArray, NDArray]:
+def grid_postures(
+    plane: Plane, paths: NDArray, rest: int, *, postures_per_rest: int = 24
+) -> tuple[NDArray, NDArray]:
     """Postures on whole steps within the tolerance of one rest of some paths.
 
     Parameters
@@ -134,13 +134,15 @@ def grid_postures(plane: Plane, paths: NDArray, rest: int) -> tuple[NDArray, NDA
         Index of those paths.
     rest : int
         Number of the rest, from 0.
+    postures_per_rest : int, default 24
+        Largest number of postures that are kept per rest; usually one or two are found.
 
     Returns
     -------
     path : ndarray of int, shape (c,)
         Path of each posture, ascending.
     posture : ndarray, shape (c, 3)
-        Postures in steps, at most `POSTURES_PER_REST` per path, the nearest ones first.
+        Postures in steps, at most `postures_per_rest` per path, the nearest ones first.
 
     """
     points, tolerance = plane.rests[paths, rest], plane.tolerance[paths]
@@ -164,5 +166,5 @@ def grid_postures(plane: Plane, paths: NDArray, rest: int) -> tuple[NDArray, NDA
     _, index = np.unique(keys, axis=0, return_index=True)
     index = index[np.lexsort((error[index], owner[index]))]
     rank = np.arange(index.size) - np.searchsorted(owner[index], owner[index])
-    index = index[rank < POSTURES_PER_REST]
+    index = index[rank < postures_per_rest]
     return paths[owner[index]], posture[index]

@@ -26,8 +26,6 @@ from retwin.checks import require
 
 PATHS_PER_BATCH = 32
 """Number of paths that are solved together: they fit the cache, and every core has work."""
-LONGEST_STOP = 25
-"""Number of samples below which a stop within a movement is bridged: rounding hides slow steps."""
 
 
 @dataclass(frozen=True)
@@ -161,14 +159,22 @@ def _check(path: NDArray, arm: YawPitchArm) -> None:
     check_finite("path", path)
 
 
-def _movements(path: NDArray) -> list[tuple[int, int]]:
-    """First and last moving step (from sample i to i + 1) of each movement in a path (T, 3)."""
+def _movements(path: NDArray, *, longest_stop: int = 25) -> list[tuple[int, int]]:
+    """First and last moving step (from sample i to i + 1) of each movement in a path (T, 3).
+
+    Parameters
+    ----------
+    longest_stop : int, default 25
+        Number of samples below which a stop within a movement is bridged: rounding hides slow
+        steps.
+
+    """
     speed = np.linalg.norm(np.diff(path, axis=0), axis=1)
     moving = np.flatnonzero(speed > 1e-9 + 6 * path_noise(path[None])[0])
     found: list[tuple[int, int]] = []
     for step in moving.tolist():
         # Short stops are bridged, but no movement lasts longer than the longest ramp.
-        if found and step - found[-1][1] < LONGEST_STOP and step - found[-1][0] <= RAMPS[-1]:
+        if found and step - found[-1][1] < longest_stop and step - found[-1][0] <= RAMPS[-1]:
             found[-1] = (found[-1][0], step)
         else:
             found.append((step, step))

@@ -25,14 +25,8 @@ COMBINATIONS = np.stack([axis.ravel() for axis in np.indices((3, 3, 3))], axis=1
 """Combinations (27, 3) of ramp durations: the index of each motor's duration."""
 DURATIONS_USED = (COMBINATIONS[:, None] == np.arange(3)[:, None]).any(axis=2)
 """Which (27, 3) of the three ramp durations occur in a combination."""
-REFINED_GUESSES = 8
-"""Number of explanations per path that are refined where none is good."""
 KEPT_GUESSES = 4
 """Number of explanations per path that are kept from one movement to the next."""
-GRID_GUESSES = 24
-"""The same on the grid, where each costs little."""
-STARTS_PER_COMBINATION = 8
-"""Number of local minima of the coarse scan from which each combination of ramps is fitted."""
 DIRECTIONS = 90
 """Number of directions of the last link from which the search starts, 4 degrees apart."""
 
@@ -89,7 +83,7 @@ class Explanations:
         return more
 
 
-def grid_chain(plane: Plane, paths: NDArray) -> Explanations:
+def grid_chain(plane: Plane, paths: NDArray, *, grid_guesses: int = 24) -> Explanations:
     """Find whole-step postures.
 
     Parameters
@@ -98,6 +92,8 @@ def grid_chain(plane: Plane, paths: NDArray) -> Explanations:
         All paths.
     paths : ndarray of int
         Index of the paths that are explained.
+    grid_guesses : int, default 24
+        The same on the grid, where each costs little.
 
     Returns
     -------
@@ -122,11 +118,13 @@ def grid_chain(plane: Plane, paths: NDArray) -> Explanations:
         more = guesses.extend(
             guess[pair], move, new[pair], COMBINATIONS[combination], cost[pair, combination]
         )
-        guesses = _best(plane, more, GRID_GUESSES, 4.0)
+        guesses = _best(plane, more, grid_guesses, 4.0)
     return _decide(plane, guesses)
 
 
-def free_chain(plane: Plane, paths: NDArray, effort: int = 1) -> Explanations:
+def free_chain(
+    plane: Plane, paths: NDArray, effort: int = 1, *, refined_guesses: int = 8
+) -> Explanations:
     """Find continuous postures, movement by movement and then for a whole path together.
 
     Parameters
@@ -137,6 +135,8 @@ def free_chain(plane: Plane, paths: NDArray, effort: int = 1) -> Explanations:
         Index of the paths that are explained.
     effort : int, default 1
         Factor of the number of starts and of the number of explanations that are kept.
+    refined_guesses : int, default 8
+        Number of explanations per path that are refined where none is good.
 
     Returns
     -------
@@ -160,7 +160,7 @@ def free_chain(plane: Plane, paths: NDArray, effort: int = 1) -> Explanations:
         again = guesses.rows(poor[guesses.path])
         every = np.ones((again.path.size, 27), dtype=bool)
         other = more.rows(poor[more.path]).join(_search(plane, move, again, every, effort, 40))
-        other = _best(plane, other, REFINED_GUESSES * effort, np.inf)
+        other = _best(plane, other, refined_guesses * effort, np.inf)
         _refine(plane, other, on_grid, move + 1, 12)
         # A rest that the arm cannot attain: the posture is kept and then refined.
         more = more.rows(~poor[more.path]).join(other)
@@ -200,9 +200,23 @@ def _decide(plane: Plane, found: Explanations) -> Explanations:
 
 
 def _search(
-    plane: Plane, move: int, guesses: Explanations, fits: NDArray, effort: int, starts: int
+    plane: Plane,
+    move: int,
+    guesses: Explanations,
+    fits: NDArray,
+    effort: int,
+    starts: int,
+    *,
+    starts_per_combination: int = 8,
 ) -> Explanations:
-    """Ramps among those that fit (g, 27), and next postures, for one movement of guesses."""
+    """Ramps among those that fit (g, 27), and next postures, for one movement of guesses.
+
+    Parameters
+    ----------
+    starts_per_combination : int, default 8
+        Number of local minima of the coarse scan from which each combination of ramps is fitted.
+
+    """
     scan, usable = _curve(plane, guesses.path, move + 1, DIRECTIONS * min(effort, 2))
     guess, combination = np.nonzero(fits & np.any(usable, axis=1, keepdims=True))
     old, lengths = guesses.postures[guess, move], COMBINATIONS[combination]
@@ -224,13 +238,13 @@ def _search(
     cost = cost.reshape(guess.size, 2, usable.shape[1] // 2)
     minimum = (cost <= np.roll(cost, 1, axis=2)) & (cost <= np.roll(cost, -1, axis=2))
     low = np.where(minimum, cost, np.inf).reshape(guess.size, usable.shape[1])
-    number = STARTS_PER_COMBINATION * effort
+    number = starts_per_combination * effort
     nth = np.argpartition(low, number, axis=1)[:, :number]
     which, rank = np.nonzero(np.isfinite(np.take_along_axis(low, nth, axis=1)))
     ends = postures(which, nth[which, rank])
     free = np.array([False, True])
     for rounds, some, kept in ((4, coarse, starts * effort), (8, half, KEPT_GUESSES * effort)):
-        ends, costs, _ = _fitted(
+        ends, costs, _ = _fit_postures(
             plane, ends, part[which][:, :, some], data[which][:, :, some], free, rounds
         )
         order = np.lexsort((costs[:, 0], guess[which]))
@@ -294,7 +308,7 @@ def _costs(error: NDArray) -> NDArray:
     return (error**2).sum(axis=3).mean(axis=2)
 
 
-def _fitted(
+def _fit_postures(
     plane: Plane, postures: NDArray, part: NDArray, data: NDArray, free: NDArray, rounds: int
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Postures (p, m + 1, 3) where they are free, fitted together; their costs and Jacobian."""
@@ -330,7 +344,9 @@ def _refine(plane: Plane, guesses: Explanations, on_grid: NDArray, moves: int, r
     part, data = _movements(plane, path, first, guesses.lengths[:, :moves])
     free = np.ones((path.size, moves + 1), dtype=bool)
     free[:, 0] = ~on_grid[path]
-    ends, cost, slope = _fitted(plane, guesses.postures[:, : moves + 1], part, data, free, rounds)
+    ends, cost, slope = _fit_postures(
+        plane, guesses.postures[:, : moves + 1], part, data, free, rounds
+    )
     guesses.postures[:, : moves + 1], guesses.cost[:, :moves] = ends, cost
     matrix = slope.swapaxes(1, 2) @ slope + 1e-16 * np.eye(slope.shape[2])
     variance = np.abs(np.einsum("nii->ni", np.linalg.inv(matrix))).reshape(ends.shape)

@@ -25,28 +25,23 @@ class DataCase(Protocol):
     @property
     def inputs(self) -> Channels:
         """Names and units of the commands."""
-        ...
 
     @property
     def outputs(self) -> Channels:
         """Names and units of the outputs."""
-        ...
 
     @property
     def rate(self) -> float:
         """Samples per second; 0 where any will do, as with a twin that has no rate of its own."""
-        ...
 
     @property
     def classes(self) -> tuple[str, ...]:
         """The class names, in their fixed order; () where any will do."""
-        ...
 
     def complete(
         self, trajectories: Trajectories, *, progress: Progress | None = None
     ) -> Trajectories:
         """`trajectories` with the commands that the file does not hold, and their channels."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -175,11 +170,11 @@ def assemble(
     width = commands[0].shape[1] + 2 * first.nominal.shape[1]
     budget.take(len(raws) * steps * width * (first.nominal.itemsize + 1))
     lengths = np.array([len(raw.nominal) for raw in raws])
-    observed = _padded([raw.observed for raw in raws], steps)
+    observed = _pad([raw.observed for raw in raws], steps)
     present = np.arange(steps)[None, :, None] < lengths[:, None, None]
     return Trajectories(
-        commands=_padded(commands, steps),
-        nominal=_padded([raw.nominal for raw in raws], steps),
+        commands=_pad(commands, steps),
+        nominal=_pad([raw.nominal for raw in raws], steps),
         observed=observed,
         rate=_common_rate(raws, case, rate),
         mask=np.isfinite(observed) & present,
@@ -258,7 +253,7 @@ def settle(
     return case.complete(settled, progress=progress)
 
 
-def _padded(blocks: Sequence[NDArray], steps: int) -> NDArray:
+def _pad(blocks: Sequence[NDArray], steps: int) -> NDArray:
     """(n, steps, k) from blocks (T, k), each padded with its last value."""
     kind = np.result_type(*{block.dtype for block in blocks})
     padded = np.empty((len(blocks), steps, blocks[0].shape[1]), kind)

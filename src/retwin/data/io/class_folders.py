@@ -29,8 +29,6 @@ VARIABLES = ("trajCmds", "trajResps", "dataset", "motorCmdsRadius")
 """The variables of these files that are read."""
 BYTES_PER_BLOCK, BYTES_PER_NUMBER = 2**20, 8
 """Bytes of a CSV file that are read together to count its numbers, and those of a number."""
-PERIOD_RATIO = 1.5
-"""The largest ratio of two sample periods that count as jitter: one sample less makes it 2."""
 
 
 def read_class_folders(
@@ -212,8 +210,17 @@ def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None,
     return np.stack(vectors, axis=1), next(iter(rates), None)
 
 
-def _series(cell: Any, where: str) -> tuple[NDArray | None, float | None]:
-    """Values (T,) and sample rate (Hz) of one motor; None for what cannot be decoded."""
+def _series(
+    cell: Any, where: str, *, period_ratio: float = 1.5
+) -> tuple[NDArray | None, float | None]:
+    """Values (T,) and sample rate (Hz) of one motor; None for what cannot be decoded.
+
+    Parameters
+    ----------
+    period_ratio : float, default 1.5
+        The largest ratio of two sample periods that count as jitter: one sample less makes it 2.
+
+    """
     if cell is None:
         return None, None
     data = _vector(cell.get("Data") if isinstance(cell, dict) else cell, where)
@@ -230,7 +237,7 @@ def _series(cell: Any, where: str) -> tuple[NDArray | None, float | None]:
         remedy="repair the Time of the motor commands",
     )
     require(
-        periods.max() <= PERIOD_RATIO * periods.min(),
+        periods.max() <= period_ratio * periods.min(),
         where,
         expected="a constant sample rate",
         got=f"steps from {periods.min():g} to {periods.max():g} s",

@@ -44,12 +44,6 @@ KEY = "retwin"
 """The attribute of the Zarr group that holds the header."""
 CODECS = ["BytesCodec", "ZstdCodec"]
 """How arrays are stored, which is what Zarr does by default."""
-LEVEL = 1
-"""Level of the compression of chunks: half the time of the default, for a file 1 % larger."""
-COPIES = 3
-"""Arrays of the size of a chunk that are in memory while one is unpacked and checked."""
-BYTES_PER_TRAJECTORY = 32
-"""Memory for the place of a trajectory in a set of which a part is read."""
 TEXTS = ("labels", "ids")
 """The arrays of texts, which are stored in the header."""
 
@@ -111,7 +105,7 @@ def read_zarr(
         copy, the memory has none for a chunk, or the package zarr is not installed.
 
     """
-    with _opened(path) as (group, header):
+    with _open(path) as (group, header):
         budget = Budget(path.name, max_bytes, disk=tempfile.gettempdir())
         if header["schema"] == CHUNKED:
             return _read_chunks(group, header, path.name, rows, budget)
@@ -120,7 +114,7 @@ def read_zarr(
             shape = header["arrays"][name]["shape"]
             _check_size(group[name], shape, TRAJECTORIES_PER_CHUNK, path.name)
             budget.take(group[name].nbytes)
-            arrays[name] = _copied(group[name])
+            arrays[name] = _copy(group[name])
         return restore(header, arrays, path.name)[rows]
 
 
@@ -133,12 +127,12 @@ def read_header(path: Path) -> dict[str, Any]:
         See `read_zarr`.
 
     """
-    with _opened(path) as (_, header):
+    with _open(path) as (_, header):
         return header
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
+def _open(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
     """The group in a folder, and its header; InputError for every exception in the block."""
     zarr, about = _zarr(), "zarr.json"
     expected = "a readable Zarr folder of trajectories"
@@ -152,10 +146,17 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
         yield group, dict(header)
 
 
-def create_chunked(path: Path, header: Mapping[str, Any], dtype: DTypeLike) -> None:
+def create_chunked(
+    path: Path, header: Mapping[str, Any], dtype: DTypeLike, *, level: int = 1
+) -> None:
     """Make the arrays of `chunked_header` in the new folder `path`, still without any values.
 
     Numbers are stored as `dtype`.
+
+    Parameters
+    ----------
+    level : int, default 1
+        Level of the compression of chunks: half the time of the default, for a file 1 % larger.
 
     Raises
     ------
@@ -170,7 +171,7 @@ def create_chunked(path: Path, header: Mapping[str, Any], dtype: DTypeLike) -> N
         shape = header["arrays"][name]["shape"]
         chunks = (header["chunk"], *(max(1, size) for size in shape[1:]))
         kind = kinds.get(name, np.dtype(dtype)).newbyteorder("<")
-        codec = zarr.codecs.ZstdCodec(level=LEVEL)
+        codec = zarr.codecs.ZstdCodec(level=level)
         group.create_array(name, shape=shape, dtype=kind, chunks=chunks, compressors=codec)
 
 
@@ -197,7 +198,7 @@ def seal_chunked(path: Path, header: Mapping[str, Any]) -> None:
     _zarr().open_group(str(path), mode="r+").attrs[KEY] = dict(header)
 
 
-def _copied(stored: Any) -> NDArray:
+def _copy(stored: Any) -> NDArray:
     """An array of Zarr as a memory map; one chunk at a time is in memory."""
     if not stored.size:
         return np.empty(stored.shape, stored.dtype)
@@ -208,14 +209,27 @@ def _copied(stored: Any) -> NDArray:
 
 
 def _read_chunks(
-    group: Any, header: Mapping[str, Any], where: str, rows: slice, budget: Budget
+    group: Any,
+    header: Mapping[str, Any],
+    where: str,
+    rows: slice,
+    budget: Budget,
+    *,
+    bytes_per_trajectory: int = 32,
 ) -> Trajectories:
-    """The trajectories at `rows` that did not fail; one chunk at a time is in memory."""
+    """The trajectories at `rows` that did not fail; one chunk at a time is in memory.
+
+    Parameters
+    ----------
+    bytes_per_trajectory : int, default 32
+        Memory for the place of a trajectory in a set of which a part is read.
+
+    """
     size = int(header["chunk"])
     for name in CHUNKED_NAMES:
         _check_size(group[name], header["arrays"][name]["shape"], size, where)
     count = group["labels"].shape[0]
-    Budget(where).take(BYTES_PER_TRAJECTORY * count)
+    Budget(where).take(bytes_per_trajectory * count)
     index = np.arange(count)[rows]
     for name in CHUNKED_NAMES:
         budget.take(len(index) * group[name].nbytes // max(1, count))
@@ -238,8 +252,15 @@ def _read_chunks(
     return restore_chunked(header, arrays, np.concatenate(good))
 
 
-def _check_size(array: Any, shape: list[int], chunk: int, where: str) -> None:
-    """Check the layout of an array, and the size of its chunks, before memory is allocated."""
+def _check_size(array: Any, shape: list[int], chunk: int, where: str, *, copies: int = 3) -> None:
+    """Check the layout of an array, and the size of its chunks, before memory is allocated.
+
+    Parameters
+    ----------
+    copies : int, default 3
+        Arrays of the size of a chunk that are in memory while one is unpacked and checked.
+
+    """
     where = f"{where}: {array.basename}"
     chunks = (min(array.chunks[0], chunk), *(max(1, size) for size in shape[1:]))
     require(
@@ -258,7 +279,7 @@ def _check_size(array: Any, shape: list[int], chunk: int, where: str) -> None:
         got=", ".join(codecs),
         remedy="the folder is damaged: get or make it again",
     )
-    Budget(where).take(COPIES * math.prod(chunks) * array.dtype.itemsize)
+    Budget(where).take(copies * math.prod(chunks) * array.dtype.itemsize)
 
 
 def _chunk(stored: Any, number: int) -> NDArray:

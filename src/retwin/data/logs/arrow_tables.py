@@ -16,10 +16,6 @@ from retwin.data.tables import Table
 
 FILES = (b"ARROW1", b"FEA1\0\0")
 """How files of Arrow begin that are no streams."""
-MAX_DEPTH = 8
-"""Structures inside structures at most."""
-MAX_ELEMENTS = 64
-"""Elements of a list of fixed length that become signals."""
 
 
 def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
@@ -97,17 +93,28 @@ def _by_title(titles: Sequence[str]) -> dict[str, tuple[str, str]]:
     return dict(zip(titles, named_units(titles), strict=True))
 
 
-def _leaves(arrow: Any, name: str, column: Any, depth: int) -> Iterator[tuple[str, Any]]:
-    """The columns inside a column of structures, or of lists of one length."""
+def _leaves(
+    arrow: Any, name: str, column: Any, depth: int, *, max_depth: int = 8, max_elements: int = 64
+) -> Iterator[tuple[str, Any]]:
+    """The columns inside a column of structures, or of lists of one length.
+
+    Parameters
+    ----------
+    max_depth : int, default 8
+        Structures inside structures at most.
+    max_elements : int, default 64
+        Elements of a list of fixed length that become signals.
+
+    """
     kind = column.type
-    if depth < MAX_DEPTH and arrow.types.is_struct(kind):
+    if depth < max_depth and arrow.types.is_struct(kind):
         for place in range(kind.num_fields):
             field = arrow.compute.struct_field(column, [place])
             yield from _leaves(arrow, f"{name}.{kind.field(place).name}", field, depth + 1)
     elif (
-        depth < MAX_DEPTH
+        depth < max_depth
         and arrow.types.is_fixed_size_list(kind)
-        and kind.list_size <= MAX_ELEMENTS
+        and kind.list_size <= max_elements
     ):
         for place in range(kind.list_size):
             element = arrow.compute.list_element(column, place)

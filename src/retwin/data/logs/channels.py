@@ -15,19 +15,14 @@ from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Log, Signa
 from retwin.data.logs.units import converted, same_unit
 from retwin.data.measured import stand_in
 from retwin.data.provenance import Sampling
-from retwin.data.resampling import Resampling, longest_bridge, resampled
+from retwin.data.resampling import Resampling, longest_bridge, resample
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 
-DISORDER = 10.0
-"""Longest step back in time, in median intervals, that is a matter of order: messages of several
-processes overtake each other. A longer one is a clock that was set."""
 HOUR = 3600.0
 """By how much clocks are set back at the end of summer time, in s."""
 EVEN = 0.1
 """Share of intervals that differ, and relative difference from the median, of even rows."""
-DECIMATED = 1.5
-"""Ratio of the rates from which linear resampling leaves out values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +51,10 @@ class Channel:
     longest: float
     notes: tuple[str, ...]
 
-    def sampled(self, grid: NDArray, period: float, end: float) -> NDArray:
+    def resample(self, grid: NDArray, period: float, end: float) -> NDArray:
         """Its values (N,) on a grid of times, NaN where they are missing."""
         last = end if self.how == "hold" else None
-        return resampled(
+        return resample(
             self.signal.times,
             self.signal.values,
             grid,
@@ -69,13 +64,20 @@ class Channel:
             end=last,
         )
 
-    def sampling(self, rate: float, missing: float) -> Sampling:
-        """What its provenance says, with the share of its samples that are missing."""
+    def sampling(self, rate: float, missing: float, *, decimated: float = 1.5) -> Sampling:
+        """What its provenance says, with the share of its samples that are missing.
+
+        Parameters
+        ----------
+        decimated : float, default 1.5
+            Ratio of the rates from which linear resampling leaves out values.
+
+        """
         at = self.signal.times[np.isfinite(self.signal.values)]
         steps = np.diff(at)
         own = 1 / float(np.median(steps)) if len(steps) else 0.0
         notes = list(self.notes)
-        if self.how != "hold" and own > DECIMATED * rate:
+        if self.how != "hold" and own > decimated * rate:
             notes.append("samples left out, not filtered")
         return Sampling(
             self.name,
@@ -245,11 +247,17 @@ def signal_of(log: Log, name: str) -> Signal:
     )
 
 
-def in_order(signal: Signal, where: str) -> tuple[Signal, list[str]]:
+def in_order(signal: Signal, where: str, *, disorder: float = 10.0) -> tuple[Signal, list[str]]:
     """The signal with times that increase, and notes of what was done for that.
 
     Where times are not in order, only values that are there count: in a table of several topics,
     rows with the same time each hold a value of one of them.
+
+    Parameters
+    ----------
+    disorder : float, default 10.0
+        Longest step back in time, in median intervals, that is a matter of order: messages of
+        several processes overtake each other. A longer one is a clock that was set.
 
     Raises
     ------
@@ -285,7 +293,7 @@ def in_order(signal: Signal, where: str) -> tuple[Signal, list[str]]:
         remedy="record UTC, or add its offset to each time (+02:00), or split the log there",
     )
     require(
-        -steps[worst] <= DISORDER * typical,
+        -steps[worst] <= disorder * typical,
         place,
         expected="times that increase",
         got=f"a step back of {-steps[worst]:g} s at {times[worst]:g} s",

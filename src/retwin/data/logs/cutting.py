@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import at_most, require
+from retwin.checks import at_least, at_most, require
 from retwin.data.logs.mapping import Cut
 from retwin.data.logs.signals import Signal
 from retwin.errors import InputError
@@ -56,17 +56,12 @@ def pieces(
 
     """
     times = union_of_times(signals)
-    require(
-        len(times),
-        "mapping",
-        expected="values of the signals that it names",
-        got="none",
-        remedy="map signals that the log has values of",
-    )
+    remedy = "map signals that the log has values of"
+    at_least("mapping", times, 1, "value of the signals that it names", remedy=remedy)
     whole = Piece(float(times[0]), float(times[-1]))
     if cut.by == "trigger":
         assert trigger is not None
-        found = _triggered(cut, trigger, whole.stop)
+        found = _cut_at_triggers(cut, trigger, whole.stop)
     elif cut.by == "gap":
         breaks = np.flatnonzero(np.diff(times) > (cut.gap or 0.0))
         starts = times[np.concatenate([[0], breaks + 1])]
@@ -76,7 +71,7 @@ def pieces(
         found = [whole]
     _check_count(len(found))
     if cut.by != "trigger":
-        found = [_begun(each, commands) for each in found]
+        found = [_begin_with_commands(each, commands) for each in found]
     if cut.by == "length":
         assert cut.length is not None
         (only,) = found
@@ -101,7 +96,7 @@ def _check_count(count: int) -> None:
     at_most("cut", count, MAX_PIECES, "trajectories", remedy=remedy)
 
 
-def _begun(piece: Piece, commands: Sequence[Signal]) -> Piece:
+def _begin_with_commands(piece: Piece, commands: Sequence[Signal]) -> Piece:
     """The piece from the first time on at which all commands have a value in it."""
     begins = [piece.start]
     for each in commands:
@@ -112,7 +107,7 @@ def _begun(piece: Piece, commands: Sequence[Signal]) -> Piece:
     return Piece(max(begins), piece.stop)
 
 
-def _triggered(cut: Cut, trigger: Signal, end: float) -> list[Piece]:
+def _cut_at_triggers(cut: Cut, trigger: Signal, end: float) -> list[Piece]:
     known = np.isfinite(trigger.values)
     at, values = trigger.times[known], trigger.values[known]
     above = values > cut.level if cut.edge == "rising" else values < cut.level

@@ -27,9 +27,6 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-SPARSE = 100.0
-"""Samples per value of a log from which its times, or the sample rate, are wrong."""
-
 
 def read_mapped(
     path: Path,
@@ -87,7 +84,7 @@ def mapped(
 
     """
     found = parts_of(log, mapping, budget=budget, case=case, rate=rate)
-    return _finished(log, found.raws(log, mapping.label), found, case, budget)
+    return _finish(log, found.raws(log, mapping.label), found, case, budget)
 
 
 def parts_of(
@@ -127,7 +124,7 @@ def parts_of(
     return found
 
 
-def tried(log: Log, mapping: Mapping | None, *, case: DataCase | None = None) -> Parts | str:
+def try_mapping(log: Log, mapping: Mapping | None, *, case: DataCase | None = None) -> Parts | str:
     """The parts of a log that a proposed mapping makes trajectories, or why there are none.
 
     Parameters
@@ -184,7 +181,7 @@ class Parts:
         spread = (piece.stop - piece.start) * self.rate
         count = max(0, round(spread)) if piece.open_end else int(spread + SAME) + 1
         grid = piece.start + np.arange(count) / self.rate
-        columns = [each.sampled(grid, 1 / self.rate, self.end) for each in self.every]
+        columns = [each.resample(grid, 1 / self.rate, self.end) for each in self.every]
         block = np.stack(columns, axis=1) if count else np.empty((0, len(columns)))
         known = np.isfinite(block)
         needed = known[:, : self.needed]
@@ -260,7 +257,7 @@ class Parts:
         return [f"{', '.join(own)}: {note}" for note, own in channels.items()]
 
 
-def _finished(
+def _finish(
     log: Log,
     raws: Sequence[Raw],
     found: Parts,
@@ -307,14 +304,28 @@ def _rate(mapping: Mapping, case: DataCase | None, rate: float | None) -> float:
 
 
 def _check_dense(
-    log: Log, parts: Sequence[Piece], rate: float, densest: Signal, budget: Budget, width: int
+    log: Log,
+    parts: Sequence[Piece],
+    rate: float,
+    densest: Signal,
+    budget: Budget,
+    width: int,
+    *,
+    sparse: float = 100.0,
 ) -> None:
-    """Refuse times in another unit, and times between which there are many more samples."""
+    """Refuse times in another unit, and times between which there are many more samples.
+
+    Parameters
+    ----------
+    sparse : float, default 100.0
+        Samples per value of a log from which its times, or the sample rate, are wrong.
+
+    """
     samples = sum(each.stop - each.start for each in parts) * rate
     values, span = len(densest.times), samples / rate
     remedy = 'check rate, and column and unit of [time], in the mapping; by = "gap" in [cut] '
     remedy += "leaves out pauses"
-    got, wrong = f"{values} values in {span:g} s", samples > SPARSE * max(values, 2)
+    got, wrong = f"{values} values in {span:g} s", samples > sparse * max(values, 2)
     unit = misread_unit(span / max(values - 1, 1), 1 / rate) if wrong or samples < 1 else ""
     if unit:
         got += f", as if times in {unit} were read as s"

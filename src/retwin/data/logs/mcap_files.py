@@ -38,14 +38,14 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
         try:
             for schema, channel, message in reader.iter_messages(log_time_order=False):
                 if series.wants(channel.topic):
-                    decode = partial(_decoded, types, schema, channel, message.data)
+                    decode = partial(_decode, types, schema, channel, message.data)
                     series.add(channel.topic, str(channel.id), message.log_time, decode)
         except (exceptions.EndOfFile, struct.error):
             raise _cut_off(path) from None
     yield from series.found()
 
 
-def _decoded(types: Types, schema: Any, channel: Any, data: bytes) -> Any:
+def _decode(types: Types, schema: Any, channel: Any, data: bytes) -> Any:
     """A message; `Undecoded` if it is in another encoding or of an unknown type."""
     encoding = channel.message_encoding
     if encoding == "json":

@@ -52,17 +52,7 @@ def _signal(
     group, index = place
     if file.masters_db.get(group) is None:
         return Skipped(title, "without a channel of times")
-    try:
-        found = file.get(group=group, index=index, ignore_invalidation_bits=True)
-    except MemoryError:
-        raise
-    except Exception as error:
-        raise InputError(
-            path.name,
-            expected=f"samples of {title!r}",
-            got=f"what cannot be read ({type(error).__name__}: {str(error)[:80]})",
-            remedy="the file is damaged: get or make it again",
-        ) from None
+    found = file.get(group=group, index=index, ignore_invalidation_bits=True)
     declared = int(file.groups[group].channel_group.cycles_nr)
     if len(found.samples) < declared:
         raise InputError(

@@ -43,18 +43,10 @@ COMMAND = re.compile(
 """Words in the names of commands."""
 OVERHEAD = re.compile(r"covariance|/rosout|/parameter_events|/tf_static|\.seq$|/diagnostics")
 """Names of what describes the log and not the system."""
-MAX_CHANNELS = 24
-"""Channels that are proposed without a case; the other signals are listed."""
-ALIKE = 0.72
-"""Least score of a name that is taken for a channel's."""
 STAMPED = (".mcap", "", ".db3", ".bag")
 """Formats whose messages may have header stamps."""
-MAX_STAMP_AGE = 60.0
-"""Median time in s from stamp to recording at which the stamps are those of another clock."""
 PAUSE, PAUSE_PERIODS = 1.0, 20.0
 """The shortest pause in s, and in sample periods, between two trajectories."""
-JITTER = 0.005
-"""Relative difference up to which a measured rate stands for one of two digits."""
 
 
 @dataclass(frozen=True)
@@ -139,18 +131,30 @@ def propose_mapping(
             if mapping is not None and not proposal.open_channels
             else [each.name for each in proposal.facts if _moves(each)]
         )
-        other = _stamped(path, proposal, names, stamped, Budget(path.name, limit))
+        other = _read_stamped(path, proposal, names, stamped, Budget(path.name, limit))
         if other is not None:
             made = proposed(log, stamped, case=case, delay=other[1])
             proposal = replace(made, log=other[0])
     return proposal
 
 
-def _stamped(
-    path: Path, proposal: Proposal, names: Collection[str], stamped: TimeSettings, budget: Budget
+def _read_stamped(
+    path: Path,
+    proposal: Proposal,
+    names: Collection[str],
+    stamped: TimeSettings,
+    budget: Budget,
+    *,
+    max_stamp_age: float = 60.0,
 ) -> tuple[Log, float] | None:
     """Signals at the stamps of their headers, and the median time in s from there
     to the recording; None if the stamps are of no use.
+
+    Parameters
+    ----------
+    max_stamp_age : float, default 60.0
+        Median time in s from stamp to recording at which the stamps are those of another clock.
+
     """
     try:
         other = read_log(path, wanted=names, clock=stamped.clock, budget=budget)
@@ -172,7 +176,7 @@ def _stamped(
         or [np.array([-1.0])]
     )
     found = float(np.median(delays))
-    return (other, found) if 0 <= found < MAX_STAMP_AGE else None
+    return (other, found) if 0 <= found < max_stamp_age else None
 
 
 def facts_of(log: Log) -> list[Fact]:
@@ -278,16 +282,30 @@ def _round(value: float) -> float:
     return float(f"{float(value):.3g}")
 
 
-def _plain(rate: float) -> float:
-    """A measured rate without the jitter of its times: 50 for 49.95."""
+def _plain(rate: float, *, jitter: float = 0.005) -> float:
+    """A measured rate without the jitter of its times: 50 for 49.95.
+
+    Parameters
+    ----------
+    jitter : float, default 0.005
+        Relative difference up to which a measured rate stands for one of two digits.
+
+    """
     plain = float(f"{rate:.2g}")
-    return plain if abs(plain / rate - 1) < JITTER else _round(rate)
+    return plain if abs(plain / rate - 1) < jitter else _round(rate)
 
 
-def _by_name(moving: Sequence[Fact]) -> Chosen:
-    """Commands and outputs by the words in their names."""
+def _by_name(moving: Sequence[Fact], *, max_channels: int = 24) -> Chosen:
+    """Commands and outputs by the words in their names.
+
+    Parameters
+    ----------
+    max_channels : int, default 24
+        Channels that are proposed without a case; the other signals are listed.
+
+    """
     chosen: Chosen = {"commands": {}, "outputs": {}}
-    for fact in moving[:MAX_CHANNELS]:
+    for fact in moving[:max_channels]:
         table = "commands" if COMMAND.search(fact.name.lower()) else "outputs"
         chosen[table][fact.name.lstrip("/")] = fact
     if not chosen["outputs"]:  # they are what is measured, in any case
@@ -295,8 +313,15 @@ def _by_name(moving: Sequence[Fact]) -> Chosen:
     return chosen
 
 
-def _for_case(moving: Sequence[Fact], case: DataCase) -> Chosen:
-    """For each channel of the case the signal that is most like it, each signal once."""
+def _for_case(moving: Sequence[Fact], case: DataCase, *, alike: float = 0.72) -> Chosen:
+    """For each channel of the case the signal that is most like it, each signal once.
+
+    Parameters
+    ----------
+    alike : float, default 0.72
+        Least score of a name that is taken for a channel's.
+
+    """
     channels = [
         (table, name, unit)
         for table, some in (("commands", case.inputs), ("outputs", case.outputs))
@@ -312,7 +337,7 @@ def _for_case(moving: Sequence[Fact], case: DataCase) -> Chosen:
         chosen[table][name] = None
     taken: set[str] = set()
     for score, table, name, fact in sorted(scores, key=lambda each: -each[0]):
-        if score >= ALIKE and chosen[table][name] is None and fact.name not in taken:
+        if score >= alike and chosen[table][name] is None and fact.name not in taken:
             chosen[table][name] = fact
             taken.add(fact.name)
     # Where one command is left and one signal that is named like a command, they are a pair.

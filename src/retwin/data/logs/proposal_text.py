@@ -57,7 +57,7 @@ def _comment(text: str) -> str:
     return "".join(c if c.isprintable() else " " for c in text)
 
 
-def _seen(fact: Fact) -> str:
+def _describe(fact: Fact) -> str:
     unit = f" {fact.unit}" if fact.unit else ""
     return _comment(
         f"{fact.count} values, {fact.rate:.4g} Hz, {fact.low:.4g} to {fact.high:.4g}{unit}, "
@@ -97,7 +97,7 @@ def mapping_text(
     made = Environment(
         undefined=StrictUndefined, autoescape=False, trim_blocks=True, lstrip_blocks=True
     )
-    made.filters |= {"comment": _comment, "seen": _seen, "toml": _value}
+    made.filters |= {"comment": _comment, "seen": _describe, "toml": _value}
     template = resources.files(__package__).joinpath("mapping.toml.j2").read_text("utf-8")
     text = made.from_string(template).render(
         log=log,

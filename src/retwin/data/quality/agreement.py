@@ -24,8 +24,6 @@ FASTER = 3.0
 identified have up to 1.5 by chance."""
 POWERS = 0.05, 0.25
 """Decades from one power of ten, and from a higher one, within which a unit is named."""
-MOVED = 0.1
-"""Share of the largest motion of an output below which it counts as that much."""
 OTHER, UNLIKE = GENERAL = ("other commands", "unlike the others")
 """What is wrong with a record of which nothing else is known."""
 
@@ -73,8 +71,8 @@ def find_disagreements(records: Trajectories) -> Iterator[Finding]:
         return
     own = records[healthy]
     y, ideal = y[healthy], ideal[healthy]
-    yield from _permuted(own, _squared(y, ideal))
-    yield from _exchanged(own, names, y, ideal)
+    yield from _find_permutations(own, _square(y, ideal))
+    yield from _find_exchange(own, names, y, ideal)
     yield from _units(names, y, ideal)
     yield from _time_base(own, y, ideal)
     yield from _unlike(own, names, y, ideal)
@@ -88,7 +86,7 @@ def _unit_length(values: NDArray, axis: tuple[int, ...] | int) -> NDArray:
     return np.divide(centred, length, out=np.zeros_like(centred), where=length > 0)
 
 
-def _squared(y: NDArray, ideal: NDArray) -> NDArray:
+def _square(y: NDArray, ideal: NDArray) -> NDArray:
     """Squared correlation (n, n) of the outputs of each record with the nominal ones of each.
 
     It is the mean over outputs, by the motion of each nominal one.
@@ -102,7 +100,7 @@ def _squared(y: NDArray, ideal: NDArray) -> NDArray:
     return np.asarray((found * weight).sum(axis=2) / total)
 
 
-def _permuted(records: Trajectories, squared: NDArray) -> Iterator[Finding]:
+def _find_permutations(records: Trajectories, squared: NDArray) -> Iterator[Finding]:
     """Records that fit the commands of another one, and not their own."""
     own, best = np.diag(squared), squared.argmax(axis=1)
     for i, j in enumerate(best.tolist()):
@@ -113,7 +111,7 @@ def _permuted(records: Trajectories, squared: NDArray) -> Iterator[Finding]:
             yield Finding(str(records.ids[i]), "", OTHER, text)
 
 
-def _exchanged(
+def _find_exchange(
     records: Trajectories, names: list[str], y: NDArray, ideal: NDArray
 ) -> Iterator[Finding]:
     """Pairs of outputs that fit each other's nominal outputs, in all records or in one."""
@@ -170,13 +168,20 @@ def _time_base(records: Trajectories, y: NDArray, ideal: NDArray) -> Iterator[Fi
 
 
 def _unlike(
-    records: Trajectories, names: list[str], y: NDArray, ideal: NDArray
+    records: Trajectories, names: list[str], y: NDArray, ideal: NDArray, *, moved: float = 0.1
 ) -> Iterator[Finding]:
-    """Outputs that their nominal ones explain in most healthy records, and not in one."""
+    """Outputs that their nominal ones explain in most healthy records, and not in one.
+
+    Parameters
+    ----------
+    moved : float, default 0.1
+        Share of the largest motion of an output below which it counts as that much.
+
+    """
     residual = np.nanmean((y - ideal) ** 2, axis=1)
-    motion = np.maximum(np.nanvar(y, axis=1), MOVED**2 * np.nanvar(ideal, axis=1).max(axis=0))
+    motion = np.maximum(np.nanvar(y, axis=1), moved**2 * np.nanvar(ideal, axis=1).max(axis=0))
     share = np.sum(_unit_length(y, 1) * _unit_length(ideal, 1), axis=1)
-    moving = np.nanvar(ideal, axis=1) > MOVED**2 * np.nanvar(ideal, axis=1).max(axis=0)
+    moving = np.nanvar(ideal, axis=1) > moved**2 * np.nanvar(ideal, axis=1).max(axis=0)
     unlike = (np.where(moving, 1 - share, 0.0), 1 - CLEAR**0.5), (residual, (1 - CLEAR) * motion)
     for k, name in enumerate(names):
         own = np.flatnonzero(np.isfinite(residual[:, k]))

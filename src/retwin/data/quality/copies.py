@@ -7,20 +7,13 @@ from numpy.typing import NDArray
 
 SHIFT = 3
 """Samples by which copies are shifted, at most."""
-ALIKE = 0.02
-"""Distance of two records over their motion below which they are compared sample by sample."""
-NEAR = 0.1
-"""Ratio of the difference of two records to the noise of either, below which they are copies:
-that of repeats is 1.4."""
 EXACT = 1e-5
 """The same to the range of an output, for records without noise."""
-SAME = 0.98
-"""Share of equal samples of a sensor with steps, in motion, from which on records are copies."""
 COMPARED = 10
 """Samples below which nothing is a copy."""
 
 
-def find_copies(measured: NDArray) -> list[tuple[int, int, str]]:
+def find_copies(measured: NDArray, *, alike: float = 0.02) -> list[tuple[int, int, str]]:
     """Records that are copies of earlier ones.
 
     Repeats of one program differ by their noise, copies do not. Outputs that never change are no
@@ -30,6 +23,8 @@ def find_copies(measured: NDArray) -> list[tuple[int, int, str]]:
     ----------
     measured : NDArray
         (n, T, d_y), NaN where nothing was measured.
+    alike : float, default 0.02
+        Distance of two records over their motion below which they are compared sample by sample.
 
     Returns
     -------
@@ -49,7 +44,7 @@ def find_copies(measured: NDArray) -> list[tuple[int, int, str]]:
     found = []
     for i in np.flatnonzero(moving).tolist():
         apart = np.sum((flat[:i] - flat[i]) ** 2, axis=1)
-        near = apart < 4 * SHIFT**2 * ALIKE * np.sum(flat[i] ** 2)
+        near = apart < 4 * SHIFT**2 * alike * np.sum(flat[i] ** 2)
         for j in np.flatnonzero(near & moving[:i]).tolist():
             why = _difference(measured[i], measured[j])
             if why is not None:
@@ -79,8 +74,18 @@ def _difference(one: NDArray, other: NDArray) -> str | None:
     return None
 
 
-def _repeats(a: NDArray, b: NDArray) -> bool | None:
-    """Whether an output (m,) repeats another; False if neither changes, None if it does not."""
+def _repeats(a: NDArray, b: NDArray, *, near: float = 0.1, same: float = 0.98) -> bool | None:
+    """Whether an output (m,) repeats another; False if neither changes, None if it does not.
+
+    Parameters
+    ----------
+    near : float, default 0.1
+        Ratio of the difference of two records to the noise of either, below which they are copies:
+        that of repeats is 1.4.
+    same : float, default 0.98
+        Share of equal samples of a sensor with steps, in motion, from which on records are copies.
+
+    """
     apart, spread = np.abs(a - b), np.ptp(a)
     if spread == 0 or np.ptp(b) == 0:
         return False if spread == np.ptp(b) == 0 and apart[0] <= EXACT * abs(a[0]) else None
@@ -88,12 +93,12 @@ def _repeats(a: NDArray, b: NDArray) -> bool | None:
         return True
     third = np.diff(a, n=3)
     noise = np.sqrt(np.mean(third**2) / 20)
-    if np.sqrt(np.mean(apart**2)) <= NEAR * noise and len(a) > COMPARED:
+    if np.sqrt(np.mean(apart**2)) <= near * noise and len(a) > COMPARED:
         return True
     moves = np.diff(a) != 0
     if apart.max() > 1.5 * np.abs(np.diff(a)[moves]).min():
         return None  # more than the step of any quantisation
     step = np.diff(np.unique(np.concatenate([a, b]))).min()
     quantised = len(np.unique(a)) < len(a) / 2 and moves.sum() >= COMPARED
-    alike = apart.max() <= 1.5 * step and (apart[1:][moves] < step / 2).mean() >= SAME
+    alike = apart.max() <= 1.5 * step and (apart[1:][moves] < step / 2).mean() >= same
     return True if quantised and alike else None

@@ -17,16 +17,19 @@ SHORT = 3
 """Samples of a spike at most, and jumps to one value from which on they are dropouts."""
 LONG = 0.05
 """Share of a record that a dropout lasts, at most."""
-RARE = 0.1
-"""Share of the samples that jumps are at most; what is more frequent is motion."""
-DISTINCT = 10
-"""Values of an output, at least; one with fewer is a switch, which jumps."""
 ALIKE = 1 / 3
 """Distance of the values before and after a jump over its size, at most."""
 
 
-def find_jumps(every: Sequence[Readings]) -> Iterator[Finding]:
-    """Short excursions of an output that are far larger than all other changes in all records."""
+def find_jumps(every: Sequence[Readings], *, rare: float = 0.1) -> Iterator[Finding]:
+    """Short excursions of an output that are far larger than all other changes in all records.
+
+    Parameters
+    ----------
+    rare : float, default 0.1
+        Share of the samples that jumps are at most; what is more frequent is motion.
+
+    """
     steps = [np.abs(np.diff(each.values)) for each in every]
     jumps = np.concatenate([_excursions(place, each) for place, each in enumerate(every)])
     values, counts = np.unique(jumps[:, VALUE], return_counts=True)
@@ -38,19 +41,26 @@ def find_jumps(every: Sequence[Readings]) -> Iterator[Finding]:
         if len(taken[-1]):
             jumps = jumps[~own]
     found = np.concatenate([*taken, _take_far(jumps, steps, FAR, together=False)])
-    if np.sum(found[:, END] - found[:, START]) <= RARE * sum(map(len, steps)):
+    if np.sum(found[:, END] - found[:, START]) <= rare * sum(map(len, steps)):
         for place in np.unique(found[:, PLACE]):
-            yield _described(every[int(place)], found[found[:, PLACE] == place])
+            yield _describe(every[int(place)], found[found[:, PLACE] == place])
 
 
 PLACE, START, END, SIZE, VALUE = range(5)
 """Columns of an array of jumps: record, begin and end of its samples, size, and value."""
 
 
-def _excursions(place: int, each: Readings) -> NDArray:
-    """Jumps (m, 5): values that leave those before and after, which are alike."""
+def _excursions(place: int, each: Readings, *, distinct: int = 10) -> NDArray:
+    """Jumps (m, 5): values that leave those before and after, which are alike.
+
+    Parameters
+    ----------
+    distinct : int, default 10
+        Values of an output, at least; one with fewer is a switch, which jumps.
+
+    """
     y, step = each.values, np.diff(each.values)
-    if len(np.unique(y)) <= DISTINCT:
+    if len(np.unique(y)) <= distinct:
         return np.empty((0, 5))
     pairs = [
         np.stack([t, t + n], axis=1)
@@ -93,7 +103,7 @@ def _take_far(jumps: NDArray, steps: list[NDArray], factor: float, *, together: 
     return jumps[:count]
 
 
-def _described(each: Readings, jumps: NDArray) -> Finding:
+def _describe(each: Readings, jumps: NDArray) -> Finding:
     """A finding for the jumps of one record."""
     largest = jumps[np.argmax(jumps[:, SIZE]), VALUE]
     count = int(np.sum(jumps[:, END] - jumps[:, START]))

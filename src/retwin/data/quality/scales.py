@@ -10,11 +10,6 @@ from numpy.typing import NDArray
 from retwin.data.quality.finding import Finding
 from retwin.data.trajectories import Trajectories
 
-ALIKE = 0.3
-"""Decades within which the other records agree, so that one that differs is named."""
-CLOSE = 0.05
-"""Decades from a power of ten, at most, beside half of those within which the others agree."""
-
 
 def find_scales(records: Trajectories) -> Iterator[Finding]:
     """Channels whose values are larger by a power of ten than in all other records.
@@ -45,16 +40,25 @@ def find_scales(records: Trajectories) -> Iterator[Finding]:
                     yield Finding(str(records.ids[i]), name, "unit", text)
 
 
-def _powers(sizes: NDArray) -> NDArray | None:
-    """The power of ten (n,) by which each size differs, 0 for none; None if sizes do not agree."""
+def _powers(sizes: NDArray, *, alike: float = 0.3, close: float = 0.05) -> NDArray | None:
+    """The power of ten (n,) by which each size differs, 0 for none; None if sizes do not agree.
+
+    Parameters
+    ----------
+    alike : float, default 0.3
+        Decades within which the other records agree, so that one that differs is named.
+    close : float, default 0.05
+        Decades from a power of ten, at most, beside half of those within which the others agree.
+
+    """
     known = np.isfinite(sizes) & (sizes > 0)
     if known.sum() < 3:
         return None
     decades = np.log10(np.where(known, sizes, 1.0))
     off = np.abs(decades - np.median(decades[known])) > 0.5
     others = decades[known & ~off]
-    if len(others) <= max(1, (known & off).sum()) or np.ptp(others) > ALIKE:
+    if len(others) <= max(1, (known & off).sum()) or np.ptp(others) > alike:
         return None
     apart = np.where(known & off, decades - np.median(others), 0.0)
     power = np.rint(apart)
-    return np.where(np.abs(apart - power) < CLOSE + np.ptp(others) / 2, power, 0.0)
+    return np.where(np.abs(apart - power) < close + np.ptp(others) / 2, power, 0.0)

@@ -14,14 +14,8 @@ from retwin.data.measured import stand_in
 from retwin.data.quality.finding import Finding
 from retwin.data.quality.readings import MOVED, WINDOW, Readings
 
-LONGER = 5.0
-"""Factor by which a stretch of one value must be longer than all that are as usual."""
 FLOOR = 1e-5
 """Noise over the range of an output from which it is that of a sensor, and no rounding."""
-NOISY = 0.8
-"""Share of the windows with noise from which it is expected everywhere."""
-LAGS = 10
-"""Lags in samples at which an output may depend on what drives it."""
 RELATED = 0.5
 """Correlation from one sample to the next from which on motion is no noise."""
 
@@ -54,10 +48,10 @@ def find_stretches(every: Sequence[Readings]) -> Iterator[Finding]:
         usual = float(np.quantile(others, 0.25)) if len(others) else 0.0
         for level in _unusual(each, usual, noisy=noisy):
             start, end, count = each.span_of(level)
-            yield each.finding(*_named(each, level, start, end, count), start, end)
+            yield each.finding(*_name(each, level, start, end, count), start, end)
 
 
-def _named(each: Readings, level: float, start: int, end: int, count: int) -> tuple[str, str]:
+def _name(each: Readings, level: float, start: int, end: int, count: int) -> tuple[str, str]:
     """What a level is, and in words."""
     why = "while its twin moves" if each.ideal else "while the commands change"
     if end - start == each.size and count == 1:
@@ -67,8 +61,15 @@ def _named(each: Readings, level: float, start: int, end: int, count: int) -> tu
     return "frozen", f"stays at exactly {level:.6g}, {why} or its noise is seen elsewhere"
 
 
-def _unusual(each: Readings, usual: float, *, noisy: bool) -> list[float]:
-    """The levels that last longer than any should, or while the twin is far from them."""
+def _unusual(each: Readings, usual: float, *, noisy: bool, longer: float = 5.0) -> list[float]:
+    """The levels that last longer than any should, or while the twin is far from them.
+
+    Parameters
+    ----------
+    longer : float, default 5.0
+        Factor by which a stretch of one value must be longer than all that are as usual.
+
+    """
     values, lengths, still = each.levels
     inside = (values != each.values.min()) & (values != each.values.max())
     found = np.zeros(len(values), dtype=bool)
@@ -77,20 +78,26 @@ def _unusual(each: Readings, usual: float, *, noisy: bool) -> list[float]:
         ranked = np.sort(sums[inside])[::-1]
         first, second = np.append(ranked, [0.0, 0.0])[:2]
         normal = np.where(inside & (sums == first), second, first)
-        found |= needed & (sums >= np.maximum(WINDOW, LONGER * np.maximum(normal, least)))
+        found |= needed & (sums >= np.maximum(WINDOW, longer * np.maximum(normal, least)))
     if each.ideal:
         apart = np.abs(each.values - each.drive[:, 0])
         for place in np.flatnonzero(still >= WINDOW).tolist():
             own = np.isin(each.values, values[place])
             elsewhere = np.quantile(apart[~own], 0.9) if (~own).any() else 0.0
-            found[place] |= np.median(apart[own]) > max(LONGER * elsewhere, MOVED * each.span[0])
+            found[place] |= np.median(apart[own]) > max(longer * elsewhere, MOVED * each.span[0])
     return values[found].tolist()
 
 
-def _noisy(every: Sequence[Readings]) -> bool:
+def _noisy(every: Sequence[Readings], *, noisy: float = 0.8) -> bool:
     """Whether an output shows noise wherever it is not still, so that stillness is no rest.
 
     The value that lasts longest in a record does not count: it is what is asked about.
+
+    Parameters
+    ----------
+    noisy : float, default 0.8
+        Share of the windows with noise from which it is expected everywhere.
+
     """
     expected, found = 0, []
     for own in every:
@@ -99,7 +106,7 @@ def _noisy(every: Sequence[Readings]) -> bool:
         found.append(own.noise[own.noise > 0])
     noise = np.concatenate(found)
     values = np.unique(np.concatenate([own.values for own in every]))
-    if len(noise) < max(1, NOISY * expected) or len(values) < 2:
+    if len(noise) < max(1, noisy * expected) or len(values) < 2:
         return False
     resolution = max(np.diff(values).min(), 4 * np.spacing(np.float32(np.abs(values).max())))
     return bool(np.median(noise) > max(FLOOR * (values[-1] - values[0]), resolution))
@@ -128,10 +135,17 @@ def _next(values: NDArray) -> float:
     return float(centred[1:] @ centred[:-1] / power) if power > 0 else 1.0
 
 
-def _follows(each: Readings, drive: NDArray, limit: float) -> bool:
-    """Whether an output is correlated with what drives it, at any of the lags."""
+def _follows(each: Readings, drive: NDArray, limit: float, *, lags: int = 10) -> bool:
+    """Whether an output is correlated with what drives it, at any of the lags.
+
+    Parameters
+    ----------
+    lags : int, default 10
+        Lags in samples at which an output may depend on what drives it.
+
+    """
     y, u = each.values - each.values.mean(), drive - drive.mean(axis=0)
     scale = np.sqrt((y @ y) * (u**2).sum(axis=0))
-    most = min(LAGS, each.size // 4)
+    most = min(lags, each.size // 4)
     found = [np.abs(y[lag:] @ u[: each.size - lag]) / scale for lag in range(most + 1)]
     return bool(np.max(found) > limit)

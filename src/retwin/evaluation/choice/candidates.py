@@ -127,16 +127,16 @@ class Candidates:
         """A twin whose outputs are corrected at every sample."""
         own = self.settings.correction
         stepwise = own if own is not None and own.resolution == "step" else Additive()
-        return self._corrected(twin, stepwise, self.settings.sequence)
+        return self._correct(twin, stepwise, self.settings.sequence)
 
     def per_segment(self, correction: Correction) -> CorrectedTwin:
         """The twin with a correction that has one z per segment."""
-        return self._corrected(self.identified, correction, self.settings.density)
+        return self._correct(self.identified, correction, self.settings.density)
 
     def _noisy(self, twin: Twin) -> CorrectedTwin:
-        return self._corrected(twin, Additive(), StationaryNoise())
+        return self._correct(twin, Additive(), StationaryNoise())
 
-    def _corrected(self, twin: Twin, correction: Correction, density: object) -> CorrectedTwin:
+    def _correct(self, twin: Twin, correction: Correction, density: object) -> CorrectedTwin:
         learns = correction is self.settings.correction  # what machines have in common
         residual = fit_residual(
             twin,

@@ -16,9 +16,6 @@ from retwin.update.dynamics import DynamicsTwin
 from retwin.update.forecast_errors import LEVEL, USUAL
 from retwin.update.forecasts import forecasts, free_moments
 
-LARGE = 1e6
-"""Error, in standard deviations of an output, from which on a simulation has diverged."""
-
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
@@ -143,10 +140,17 @@ class Comparison:
         deviation = self._deviation(name, i, constant)
         return np.asarray(crps_normal(error, np.zeros_like(error), deviation) / self.spread)
 
-    def diverged(self, name: str) -> bool:
-        """Whether a simulation left any reasonable range."""
+    def diverged(self, name: str, *, large: float = 1e6) -> bool:
+        """Whether a simulation left any reasonable range.
+
+        Parameters
+        ----------
+        large : float, default 1e6
+            Error, in standard deviations of an output, from which on a simulation has diverged.
+
+        """
         return any(
-            not np.nanmax(np.abs(self.errors(name, i)) / self.spread, initial=0.0) < LARGE
+            not np.nanmax(np.abs(self.errors(name, i)) / self.spread, initial=0.0) < large
             for i in self._all
         )
 

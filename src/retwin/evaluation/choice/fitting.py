@@ -143,7 +143,7 @@ def fit(
     remarks = remarks_of(twin, records, comparison, scores, chosen, preferred, horizon)
     if horizon != settings.horizon:
         remarks = (UNSTABLE.format(horizon), *remarks)
-    predicted, deviation = _shown(comparison, chosen)
+    predicted, deviation = _predictions_of(comparison, chosen)
     found = Fitted(
         twin=model,
         chosen=chosen,
@@ -325,7 +325,7 @@ def _behind(found: Fitted, comparison: Comparison, kind: str) -> tuple[float, fl
     They are those of the parts in time, in standard deviations of the outputs.
     """
     scores = []
-    for mean, deviation in (_shown(comparison, kind), (found.predicted, found.deviation)):
+    for mean, deviation in (_predictions_of(comparison, kind), (found.predicted, found.deviation)):
         error = np.where(found.records.mask, found.records.observed - mean, np.nan)
         each = crps_normal(error, np.zeros_like(error), deviation) / comparison.spread
         scores.append(np.mean(each, axis=2))
@@ -363,7 +363,7 @@ def _row(
     )
 
 
-def _shown(comparison: Comparison, name: str) -> tuple[NDArray, NDArray]:
+def _predictions_of(comparison: Comparison, name: str) -> tuple[NDArray, NDArray]:
     """Predictions (n, T, d_y) of the parts in time that were left out, and their deviations."""
     if name not in comparison.predicted:
         nothing = np.full(comparison.records.observed.shape, np.nan)

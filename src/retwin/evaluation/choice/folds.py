@@ -14,17 +14,6 @@ from retwin.update.forecasts import values_of
 
 RECORDS = 4
 """Records from which on whole ones are left out, in so many groups at most."""
-BLOCKS = 4
-"""Blocks of time of fewer records. The first one is always fitted, so that the start of a record is
-known; each of the others is left out once."""
-REACHING = 0.25
-"""Share of the blocks that reach furthest from the mean, which are left out together."""
-SHORT = 24
-"""Blocks of time among which these are searched, per record."""
-INDEPENDENT = 5.0
-"""Length of a block of scores in correlation times, so that blocks are nearly independent."""
-SCORED = 12
-"""Blocks of scores per part that is left out, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +54,18 @@ class Fold:
         return float(range_excess(held, *value_range(others)).max())
 
 
-def folds_of(records: Trajectories) -> list[Fold]:
+def folds_of(records: Trajectories, *, blocks: int = 4) -> list[Fold]:
     """The parts of the records that are left out in turn.
 
     Whole records where there are four or more, else the last three of four blocks of time of every
     record; and the quarter of all blocks in which outputs or commands reach furthest.
+
+    Parameters
+    ----------
+    blocks : int, default 4
+        Blocks of time of fewer records. The first one is always fitted, so that the start of a
+        record is known; each of the others is left out once.
+
     """
     count, steps = records.mask.shape[:2]
     seen = np.asarray(records.mask.any(axis=2))
@@ -80,10 +76,10 @@ def folds_of(records: Trajectories) -> list[Fold]:
             for i in range(RECORDS)
         ]
     else:
-        block = np.minimum(_position(seen) * BLOCKS, BLOCKS - 1).astype(int)
+        block = np.minimum(_position(seen) * blocks, blocks - 1).astype(int)
         made = [
-            Fold(f"block {i + 1} of {BLOCKS} in time", (block == i) & seen)
-            for i in range(1, BLOCKS)
+            Fold(f"block {i + 1} of {blocks} in time", (block == i) & seen)
+            for i in range(1, blocks)
         ]
     return [*made, Fold("largest commands and outputs", _edges(records), edge=True)]
 
@@ -94,8 +90,17 @@ def _position(seen: NDArray) -> NDArray:
     return np.asarray((number - seen) / np.maximum(number[:, -1:], 1))
 
 
-def _edges(records: Trajectories) -> NDArray:
-    """The samples (n, T) of the blocks that reach furthest from the means."""
+def _edges(records: Trajectories, *, reaching: float = 0.25, short: int = 24) -> NDArray:
+    """The samples (n, T) of the blocks that reach furthest from the means.
+
+    Parameters
+    ----------
+    reaching : float, default 0.25
+        Share of the blocks that reach furthest from the mean, which are left out together.
+    short : int, default 24
+        Blocks of time among which these are searched, per record.
+
+    """
     seen = np.asarray(records.mask.any(axis=2))
     measured = np.where(records.mask, records.observed, np.nan).astype(np.float64)
     values = np.concatenate([records.commands.astype(np.float64), measured], axis=2)
@@ -106,14 +111,14 @@ def _edges(records: Trajectories) -> NDArray:
     if len(records) >= RECORDS:
         block, count = np.zeros(seen.shape, dtype=int), 1
     else:
-        count = SHORT
+        count = short
         block = np.minimum(_position(seen) * count, count - 1).astype(int)
     number = block + count * np.arange(len(records))[:, None]
     reached = np.zeros(count * len(records))
     np.maximum.at(reached, number[seen], far[seen])
     if count > 1:  # the start of a record is known
         reached[::count] = -1.0
-    chosen = np.argsort(-reached, kind="stable")[: max(1, int(REACHING * len(reached)))]
+    chosen = np.argsort(-reached, kind="stable")[: max(1, int(reaching * len(reached)))]
     return np.asarray(np.isin(number, chosen) & seen)
 
 
@@ -127,9 +132,20 @@ def block_means(values: NDArray, length: int) -> NDArray:
     return np.array(made)
 
 
-def block_length(values: NDArray, held: NDArray) -> int:
-    """Samples of a block of scores (n, T), by the correlation time of these where they are held."""
+def block_length(
+    values: NDArray, held: NDArray, *, independent: float = 5.0, scored: int = 12
+) -> int:
+    """Samples of a block of scores (n, T), by the correlation time of these where they are held.
+
+    Parameters
+    ----------
+    independent : float, default 5.0
+        Length of a block of scores in correlation times, so that blocks are nearly independent.
+    scored : int, default 12
+        Blocks of scores per part that is left out, at most.
+
+    """
     centred = np.where(held, values - values[held].mean(), 0.0)
     longest = max(1, int(held.sum(axis=1).max()))
-    shortest = max(1, int(held.sum()) // SCORED)
-    return int(np.clip(INDEPENDENT * correlation_time(centred[..., None]), shortest, longest))
+    shortest = max(1, int(held.sum()) // scored)
+    return int(np.clip(independent * correlation_time(centred[..., None]), shortest, longest))

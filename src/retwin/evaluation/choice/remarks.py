@@ -13,14 +13,8 @@ from retwin.evaluation.choice.fitted import CandidateScore
 from retwin.evaluation.choice.folds import RECORDS
 from retwin.twins.twin import Twin
 
-EXPLAINED = 0.2
-"""Share of the mean square error of the twin from which on a dead time is mentioned."""
 LONGEST = 0.1
 """Longest dead time that is tried, over the length of a record."""
-CLEAR = 2.0
-"""Standard errors of the difference of scores that are no chance."""
-BETTER = 0.1
-"""Share by which a model without the twin must be better to be mentioned."""
 
 
 def remarks_of(
@@ -70,8 +64,17 @@ def _worse_than_mean(records: Trajectories, score: CandidateScore) -> list[str]:
     ]
 
 
-def _of_twin(records: Trajectories, comparison: Comparison, name: str) -> list[str]:
-    """A missing dead time of the twin, by its own simulations."""
+def _of_twin(
+    records: Trajectories, comparison: Comparison, name: str, *, explained: float = 0.2
+) -> list[str]:
+    """A missing dead time of the twin, by its own simulations.
+
+    Parameters
+    ----------
+    explained : float, default 0.2
+        Share of the mean square error of the twin from which on a dead time is mentioned.
+
+    """
     made = []
     nominal = comparison.joined(lambda i: comparison.predicted[name][i].mean)
     for channel, output in enumerate(records.outputs.names):
@@ -83,7 +86,7 @@ def _of_twin(records: Trajectories, comparison: Comparison, name: str) -> list[s
         if np.corrcoef(x[both], y[both])[0, 1] < 0:
             continue
         delay, share = _dead_time(y, x)
-        if share >= EXPLAINED and abs(delay) >= 0.5:
+        if share >= explained and abs(delay) >= 0.5:
             seconds = delay / records.rate
             what = f"A dead time of {seconds:.3g} s"
             if delay < 0:
@@ -116,16 +119,31 @@ def _dead_time(y: NDArray, x: NDArray) -> tuple[float, float]:
     return delay, float(1 - errors[best] / present) if present > 0 else 0.0
 
 
-def without_twin(scores: Sequence[CandidateScore], chosen: CandidateScore) -> list[str]:
-    """A model without the twin that is better than the chosen candidate, in a sentence."""
+def without_twin(
+    scores: Sequence[CandidateScore],
+    chosen: CandidateScore,
+    *,
+    clear: float = 2.0,
+    better: float = 0.1,
+) -> list[str]:
+    """A model without the twin that is better than the chosen candidate, in a sentence.
+
+    Parameters
+    ----------
+    clear : float, default 2.0
+        Standard errors of the difference of scores that are no chance.
+    better : float, default 0.1
+        Share by which a model without the twin must be better to be mentioned.
+
+    """
     rivals = [
-        each for each in scores if each.rmse and -each.difference > CLEAR * each.standard_error
+        each for each in scores if each.rmse and -each.difference > clear * each.standard_error
     ]
     if not rivals:
         return []
     best = min(rivals, key=lambda each: each.nrmse)
     gain = 1 - best.nrmse / chosen.nrmse
-    if gain < BETTER:
+    if gain < better:
         return []
     return [
         f"The {best.title} predicts the same parts better by {gain:.0%}: the twin lacks something "

@@ -20,8 +20,6 @@ from retwin.twins.collected import SimulationError
 
 FAILURES = (InputError, SimulationError, RuntimeError, ArithmeticError, np.linalg.LinAlgError)
 """What ends a candidate, and not the comparison: refused records, diverging fits and trainings."""
-SHORT = 0.05
-"""Part of the length of the records over which candidates are judged that are unstable."""
 
 
 @dataclass(eq=False)
@@ -116,9 +114,16 @@ def unstable(comparison: Comparison, whole: Candidates) -> bool:
     return whole.updated is not None and bool(np.isfinite(whole.updated.horizon))
 
 
-def shorter(whole: Candidates) -> float:
-    """Time in s over which candidates are judged that are unstable in free simulation."""
+def shorter(whole: Candidates, *, short: float = 0.05) -> float:
+    """Time in s over which candidates are judged that are unstable in free simulation.
+
+    Parameters
+    ----------
+    short : float, default 0.05
+        Part of the length of the records over which candidates are judged that are unstable.
+
+    """
     records, updated = whole.records, whole.updated
     if updated is not None and np.isfinite(updated.horizon):
         return updated.horizon
-    return max(1, round(SHORT * records.steps)) / records.rate
+    return max(1, round(short * records.steps)) / records.rate

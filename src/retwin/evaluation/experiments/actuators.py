@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from retwin.checks import require
+from retwin.checks import given
 from retwin.data.trajectories import Trajectories
 from retwin.inference.design import Knowledge
 from retwin.inference.hierarchy import Likelihood
@@ -61,14 +61,13 @@ class ActuatorKnowledge:
         mask = sample_mask(correction, observed, torch.tensor(calibration.mask), context.rate)
         limits = range_in_samples(operator.delay_range, context, observed, mask)
         found, learned = operator.infer_with_hyperparameters(context, observed, mask)
-        require(
-            learned is not None,
+        learned = given(
             "calibration",
-            expected="trajectories with segments of motion",
+            learned,
+            "trajectories with segments of motion",
             got="commands that never change",
             remedy="give those that the twin was calibrated on",
         )
-        assert learned is not None
         seen = CommandProblem.of(
             context, observed, mask, delay_range=limits, max_samples=operator.max_samples
         )

@@ -18,9 +18,6 @@ from retwin.checks import require
 from retwin.inference.design import Knowledge
 from retwin.update.dynamics.twin import DynamicsTwin
 
-MAX_PREDICTIONS = 2000
-"""Outputs at most, evenly chosen from those of all reference trajectories."""
-
 
 @dataclass(frozen=True, eq=False)
 class DynamicsKnowledge:
@@ -57,13 +54,20 @@ class DynamicsKnowledge:
         )
         return cls(replace(twin, factor=factor))
 
-    def knowledge(self, commands: NDArray) -> Knowledge:
-        """The knowledge about outputs in free simulation, in deviations by noise alone."""
+    def knowledge(self, commands: NDArray, *, max_predictions: int = 2000) -> Knowledge:
+        """The knowledge about outputs in free simulation, in deviations by noise alone.
+
+        Parameters
+        ----------
+        max_predictions : int, default 2000
+            Outputs at most, evenly chosen from those of all reference trajectories.
+
+        """
         given = self._unseen(commands)
         slopes = self.twin.filter.slopes(*given)
         scaled = slopes / np.sqrt(self.twin.simulation.noise_variance(given[0]))[..., None]
         rows = scaled.reshape(-1, scaled.shape[-1])
-        rows = rows[:: max(1, len(rows) // MAX_PREDICTIONS)]
+        rows = rows[:: max(1, len(rows) // max_predictions)]
         unit = torch.eye(rows.shape[1], dtype=torch.float64)
         return Knowledge(unit, torch.tensor(rows), torch.ones(len(rows), dtype=torch.float64))
 

@@ -31,19 +31,13 @@ REFERENCES = 64
 """Trajectories of the sampler at whose segments the twin is to predict."""
 RANDOM = 32
 """Random continuations with which the chosen one is compared."""
-ORDERS = 10
-"""Random orders of the calibration trajectories, for the learning curve."""
 FURTHER = 60
 """Largest number of further trajectories that is reported as needed."""
-LEVEL = 0.9
-"""Probability of the intervals."""
 BAND = float(norm.ppf(0.975))
 """Half the width of the band outside of which a segment is faulty, in standard deviations: one
 healthy segment in twenty is outside."""
 PARTS = 4
 """Parts of the candidates, one after the other: memory."""
-FAULT = 3.0
-"""Size of the fault whose recall is given, in standard deviations of the scatter."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +182,7 @@ def next_experiments(
     least = 1 if isinstance(twin, DynamicsTwin) else MIN_TRAJECTORIES
     at_least("calibration", healthy, least, "healthy trajectories", remedy=remedy)
     references = sampler.sample(REFERENCES, rng=rng)
-    known, curve = _known(twin, healthy, references, rng)
+    known, curve = _learn(twin, healthy, references, rng)
     show(0.6)
     now = known.knowledge(references)
     drawn = sampler.sample(candidates, rng=rng)
@@ -274,19 +268,33 @@ def _first(excess: NDArray, tolerance: float) -> int | None:
     return int(small[0]) if len(small) else None
 
 
-def _spread(values: NDArray) -> tuple[float, float, float]:
-    """Mean and ends of the interval."""
-    low, high = np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+def _spread(values: NDArray, *, level: float = 0.9) -> tuple[float, float, float]:
+    """Mean and ends of the interval.
+
+    Parameters
+    ----------
+    level : float, default 0.9
+        Probability of the intervals.
+
+    """
+    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
     return float(values.mean()), float(low), float(high)
 
 
-def _recall(excess: float) -> float:
-    """Probability that a fault leaves the band, which contains 95 % of healthy segments."""
-    size = FAULT / (1 + excess)
+def _recall(excess: float, *, fault: float = 3.0) -> float:
+    """Probability that a fault leaves the band, which contains 95 % of healthy segments.
+
+    Parameters
+    ----------
+    fault : float, default 3.0
+        Size of the fault whose recall is given, in standard deviations of the scatter.
+
+    """
+    size = fault / (1 + excess)
     return float(norm.cdf(size - BAND) + norm.cdf(-size - BAND))
 
 
-def _known(
+def _learn(
     twin: CorrectedTwin | DynamicsTwin,
     healthy: Trajectories,
     references: NDArray,
@@ -305,12 +313,21 @@ def _known(
     return segments, _measured_curve(segments, rng)
 
 
-def _measured_curve(known: SegmentKnowledge, rng: np.random.Generator) -> tuple[Measured, ...]:
-    """How well subsets of the calibration trajectories predict the others."""
+def _measured_curve(
+    known: SegmentKnowledge, rng: np.random.Generator, *, orders: int = 10
+) -> tuple[Measured, ...]:
+    """How well subsets of the calibration trajectories predict the others.
+
+    Parameters
+    ----------
+    orders : int, default 10
+        Random orders of the calibration trajectories, for the learning curve.
+
+    """
     total = known.trajectories
     sizes = sorted(set(np.geomspace(2, total - 1, 5).round().astype(int).tolist()))
     found: dict[int, list[float]] = {size: [] for size in sizes}
-    for _ in range(ORDERS):
+    for _ in range(orders):
         order = rng.permutation(total)
         for size in sizes:
             found[size].append(known.subset(order[:size]).error(order[size:]))

@@ -21,12 +21,6 @@ from retwin.update.corrections import Context, Correction, Discrepancy, before_s
 from retwin.update.residual import ResidualModel
 from retwin.update.residual.model import describe
 
-ROUNDS = 10
-"""Rounds in which scatter and prior of the coefficients are estimated from each other."""
-FREEDOM = 4.0
-"""Segments for which the first guess of the scatter counts."""
-WIDE = 100.0
-"""Prior variance of a constant, relative to the mean square of z."""
 STEP = 0.1
 """Step of finite differences of z, in standard deviations of its scatter."""
 
@@ -150,14 +144,14 @@ class SegmentKnowledge:
         mean[..., self.used] = (self.design(context) @ self.coefficients.mT).float()
         every = _stride(correction, context.rate)
         times = torch.arange(0, context.commands.shape[1], every)
-        base = _applied(correction, context, mean, times)
+        base = _apply(correction, context, mean, times)
         slopes = []
         for index, deviation in zip(
             self.used.tolist(), self.scatter.diagonal().sqrt().tolist(), strict=True
         ):
             moved = mean.clone()
             moved[..., index] += STEP * deviation
-            change = _applied(correction, context, moved, times) - base
+            change = _apply(correction, context, moved, times) - base
             slopes.append(change.double() / (STEP * deviation))
         slope = torch.stack(slopes, dim=-1)  # (n, S, d_y, k)
         products = torch.einsum("ntyi,ntyj->ntij", slope, slope)
@@ -169,7 +163,7 @@ class SegmentKnowledge:
         return torch.einsum("nmt,ntij->nmij", inside, products) / self.noise**2
 
 
-def _applied(correction: Correction, context: Context, z: Tensor, times: Tensor) -> Tensor:
+def _apply(correction: Correction, context: Context, z: Tensor, times: Tensor) -> Tensor:
     """Corrected outputs (n, S, d_y) at some samples."""
     operator = before_sensor(correction)
     at = getattr(operator, "at", None)
@@ -197,19 +191,37 @@ def _with_constant(features: Tensor) -> Tensor:
     return torch.cat([torch.ones_like(features[..., :1]), features], dim=-1)
 
 
-def _regression(design: Tensor, z: Tensor, error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _regression(
+    design: Tensor,
+    z: Tensor,
+    error: Tensor,
+    *,
+    rounds: int = 10,
+    freedom: float = 4.0,
+    wide: float = 100.0,
+) -> tuple[Tensor, Tensor, Tensor]:
     """Scatter (k, k), coefficients (k, F) and their covariance, from z (m, k) with `error`.
 
     Scatter and prior variances are estimated from the data too (empirical Bayes).
+
+    Parameters
+    ----------
+    rounds : int, default 10
+        Rounds in which scatter and prior of the coefficients are estimated from each other.
+    freedom : float, default 4.0
+        Segments for which the first guess of the scatter counts.
+    wide : float, default 100.0
+        Prior variance of a constant, relative to the mean square of z.
+
     """
     count, size = z.shape
     features = design.shape[1]
     first = z.square().mean(dim=0) + error.diagonal(dim1=1, dim2=2).mean(dim=0)
     scatter = torch.diag(first)
     prior = (first / (2 * features))[:, None].repeat(1, features)
-    prior[:, 0] = WIDE * first
+    prior[:, 0] = wide * first
     mean, covariance = torch.zeros(size, features, dtype=z.dtype), torch.diag(prior.flatten())
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         precision = torch.linalg.inv(scatter)
         # z is as uncertain as its scatter at most; then it gives no information.
         about = precision - precision @ _within(error, scatter) @ precision
@@ -222,7 +234,7 @@ def _regression(design: Tensor, z: Tensor, error: Tensor) -> tuple[Tensor, Tenso
         blocks = covariance.unflatten(0, (size, features)).unflatten(2, (size, features))
         spread = torch.einsum("mf,ifjg,mg->mij", design, blocks, design)
         second = (left[..., None] * left[:, None] + spread + error).sum(dim=0)
-        scatter = (second + FREEDOM * torch.diag(first) / 2) / (count + FREEDOM)
+        scatter = (second + freedom * torch.diag(first) / 2) / (count + freedom)
         own = mean.square() + covariance.diagonal().unflatten(0, (size, features))
         shared = own[:, 1:].mean(dim=1)
         prior = torch.cat([prior[:, :1], shared[:, None].repeat(1, features - 1)], dim=1)

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Channels
+from retwin.evaluation.fidelity.stored import StoredArrays
 from retwin.scores.distributions import (
     central_band,
     cumulative_counts,
@@ -27,24 +27,9 @@ from retwin.scores.distributions import (
     share_as_far,
 )
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval
-from retwin.serialisation.files import write_atomically
 
 BINS = 100
 """Bins of the PIT histograms, which are stored; pages show fewer."""
-SHOWN_BINS = 20
-"""Bins of a PIT histogram on a page, of which each joins several of the computed ones."""
-MIN_TRAJECTORIES = 8
-"""Least number of trajectories for the classifier two-sample test: fewer do not train it."""
-FOLDS = 5
-"""Folds of its cross-validation, as scikit-learn's default."""
-MAX_PLACES = 512
-"""Largest number of values at which two distributions are compared, which bounds the memory."""
-_KEYS = {
-    **{name: name for name in ("ids", "nominal", "observed", "seen", "bands", "crps", "energy")},
-    **{name: name for name in ("pit", "features", "widening", "at_bound")},
-    "segment_values": "movements",
-}
-"""Attributes with one row per trajectory, and their keys in NPZ files."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +55,7 @@ class Figure:
 
 
 @dataclass(frozen=True, eq=False)
-class Fidelity:
+class Fidelity(StoredArrays):
     """Scores of n trajectories at P samples of d outputs; `figures` sums them up.
 
     Attributes
@@ -143,48 +128,18 @@ class Fidelity:
         """Several sets of trajectories as one, each compared with a twin of its own."""
         segments = max(part.segment_values.shape[2] for part in parts)
         padded = [
-            replace(part, segment_values=_padded(part.segment_values, segments)) for part in parts
+            replace(part, segment_values=_pad(part.segment_values, segments)) for part in parts
         ]
         arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in padded]) for name in _KEYS
+            name: np.concatenate([getattr(part, name) for part in padded])
+            for name, value in vars(padded[0]).items()
+            if isinstance(value, np.ndarray)
         }
         rivals: dict[str, Any] = {
             name: tuple(map(np.concatenate, zip(*(p.rivals[name] for p in parts), strict=True)))
             for name in parts[0].rivals
         }
         return replace(parts[0], rivals=rivals, **arrays)
-
-    def save(self, file: str | Path) -> None:
-        """Write an NPZ file; `load` reads it."""
-        arrays = {key: getattr(self, name) for name, key in _KEYS.items()}
-        for name, (crps, energy) in self.rivals.items():
-            arrays |= {f"rival/{name}/crps": crps, f"rival/{name}/energy": energy}
-        for key, channels in (("outputs", self.outputs), ("movement", self.segment_channels)):
-            arrays[key] = np.array([channels.names, channels.units])
-        about = {"rate": np.array(self.rate), "draws": np.array(self.draws)}
-        with write_atomically(Path(file)) as part:
-            np.savez_compressed(part, allow_pickle=False, **arrays, **about)
-
-    @classmethod
-    def load(cls, file: str | Path) -> Fidelity:
-        """Read what `save` wrote."""
-        with np.load(file, allow_pickle=False) as found:
-            names = [key.split("/")[1] for key in found.files if key.endswith("/crps")]
-            outputs, segment_channels = (
-                Channels(*(tuple(row.tolist()) for row in found[name]))
-                for name in ("outputs", "movement")
-            )
-            return cls(
-                outputs=outputs,
-                segment_channels=segment_channels,
-                rate=float(found["rate"]),
-                draws=int(found["draws"]),
-                rivals={
-                    name: (found[f"rival/{name}/crps"], found[f"rival/{name}/energy"])
-                    for name in names
-                },
-                **{name: found[key] for name, key in _KEYS.items()},
-            )
 
     def inside(self, level: int, *, widened: bool = False) -> NDArray:
         """Share (n, d) of each trajectory's samples inside its central 50 or 90 % band."""
@@ -202,7 +157,7 @@ class Fidelity:
         for c, name in enumerate(self.outputs.names):
             found[f"crps/{name}"] = self._positive(self.crps[:, c])
         for name, (crps, energy) in self.rivals.items():
-            found |= self._compared(name, crps, energy)
+            found |= self._compare(name, crps, energy)
         for level in (50, 90):
             found[f"coverage{level}"] = _share(self.inside(level).mean(axis=1))
         if np.isfinite(self.widening).all():
@@ -227,24 +182,23 @@ class Fidelity:
             "rivals": list(self.rivals),
             "widening": float(self.widening.mean()) if np.isfinite(self.widening).all() else None,
             "at_bound": float(self.at_bound.mean()) if np.isfinite(self.at_bound).all() else None,
-            "figures": {
-                name: {
-                    "value": each.value,
-                    "interval": None if each.interval is None else list(each.interval),
-                    "p": each.p,
-                }
-                for name, each in self.figures.items()
-            },
+            "figures": {name: asdict(each) for name, each in self.figures.items()},
         }
 
-    def pit_shares(self) -> NDArray:
-        """PIT histogram (3, `SHOWN_BINS`) over all outputs.
+    def pit_shares(self, *, shown_bins: int = 20) -> NDArray:
+        """PIT histogram (3, `shown_bins`) over all outputs.
 
         That of the measured trajectories, and its 5 and 95 % quantiles for a perfect generator on
         as many trajectories.
+
+        Parameters
+        ----------
+        shown_bins : int, default 20
+            Bins of a PIT histogram on a page, of which each joins several of the computed ones.
+
         """
         pooled = self.pit.mean(axis=(0, 2))
-        shares = pooled.reshape(len(pooled), SHOWN_BINS, -1).sum(axis=2)
+        shares = pooled.reshape(len(pooled), shown_bins, -1).sum(axis=2)
         return np.stack([shares[0], *np.quantile(shares[1:], [0.05, 0.95], axis=0)])
 
     def _positive(self, values: NDArray) -> Figure:
@@ -260,7 +214,7 @@ class Fidelity:
         interval = None if ends is None else (max(ends[0], 0.0), min(ends[1], 1.0))
         return Figure(value, interval, p)
 
-    def _compared(self, name: str, crps: NDArray, energy: NDArray) -> dict[str, Figure]:
+    def _compare(self, name: str, crps: NDArray, energy: NDArray) -> dict[str, Figure]:
         """Scores of another twin, and the paired relative differences of this one's from them."""
         found = {f"energy/{name}": self._positive(energy)}
         for c, output in enumerate(self.outputs.names):
@@ -294,12 +248,22 @@ class Fidelity:
             lambda w: np.abs(w @ cumulative[:, 0] - uniform).max(axis=1), p=share_as_far(each)
         )
 
-    def _per_segment(self, name: str, values: NDArray) -> dict[str, Figure]:
-        """KS distance of measured and drawn values (n, 1 + 19, M); for z coverage too."""
+    def _per_segment(
+        self, name: str, values: NDArray, *, max_places: int = 512
+    ) -> dict[str, Figure]:
+        """KS distance of measured and drawn values (n, 1 + 19, M); for z coverage too.
+
+        Parameters
+        ----------
+        max_places : int, default 512
+            Largest number of values at which two distributions are compared, which bounds the
+            memory.
+
+        """
         known = np.isfinite(values)
         if not (known[:, 0].any() and known[:, 1:].any()):
             return {}
-        below, count = cumulative_counts(values, MAX_PLACES)
+        below, count = cumulative_counts(values, max_places)
         equal = np.ones((1, len(self)))
         members = range(values.shape[1])
         each = np.array([ks_distance(below, count, equal, member)[0] for member in members])
@@ -318,9 +282,18 @@ class Fidelity:
         hit = ((low <= values[:, 0]) & (values[:, 0] <= high)).sum(axis=1)
         return _share(hit, np.isfinite(values[:, 0]).sum(axis=1))
 
-    def _classifier(self) -> dict[str, Figure]:
-        """AUROC of a forest that separates measured from drawn, cross-validated by trajectory."""
-        if len(self) < MIN_TRAJECTORIES:
+    def _classifier(self, *, min_trajectories: int = 8, folds: int = 5) -> dict[str, Figure]:
+        """AUROC of a forest that separates measured from drawn, cross-validated by trajectory.
+
+        Parameters
+        ----------
+        min_trajectories : int, default 8
+            Least number of trajectories for the classifier two-sample test: fewer do not train it.
+        folds : int, default 5
+            Folds of its cross-validation.
+
+        """
+        if len(self) < min_trajectories:
             return {}
         from sklearn.ensemble import ExtraTreesClassifier
         from sklearn.model_selection import GroupKFold
@@ -330,7 +303,7 @@ class Fidelity:
         measured = np.tile(np.arange(members) == 0, n)
         group = np.repeat(np.arange(n), members)
         scores = np.empty(len(rows))
-        for train, test in GroupKFold(min(n, FOLDS)).split(rows, measured, group):
+        for train, test in GroupKFold(min(n, folds)).split(rows, measured, group):
             forest = ExtraTreesClassifier(100, class_weight="balanced", random_state=0)
             forest.fit(rows[train], measured[train])
             scores[test] = forest.predict_proba(rows[test])[:, 1]
@@ -345,6 +318,6 @@ def _share(hits: NDArray, counts: NDArray | None = None) -> Figure:
     return Figure(float(hits.sum() / trials.sum()), grouped_share_interval(hits, trials))
 
 
-def _padded(values: NDArray, segments: int) -> NDArray:
+def _pad(values: NDArray, segments: int) -> NDArray:
     missing = segments - values.shape[2]
     return np.pad(values, ((0, 0), (0, 0), (0, missing), (0, 0)), constant_values=np.nan)

@@ -37,8 +37,6 @@ of its own residual model: so twins compare."""
 INFERRED = 19
 """Draws per trajectory whose z is inferred: a further draw is within their range with probability
 18 / 20 = 0.9."""
-REFERENCE = 99
-"""Draws per trajectory whose PIT is computed as that of a perfect generator: p-values of 0.01."""
 WINDOWS = 20
 """Windows of time in which the features of the classifier two-sample test are computed."""
 
@@ -91,7 +89,7 @@ def measure_fidelity(
         than 19 draws.
 
     """
-    stride = _checked(twin, trajectories, rate, draws)
+    stride = _check(twin, trajectories, rate, draws)
     if against is None:
         against = {}
         if isinstance(twin, CorrectedTwin):
@@ -173,7 +171,7 @@ def measure_widening(
     models", JASA 118 (2023): the method that pools the distributions of the groups.
 
     """
-    stride = _checked(twin, trajectories, rate, draws)
+    stride = _check(twin, trajectories, rate, draws)
     seeds = np.random.SeedSequence(seed).generate_state(len(trajectories)).tolist()
     ratios = []
     for i, twin_seed in enumerate(seeds):
@@ -187,7 +185,7 @@ def measure_widening(
     return max(1.0, further_group_quantile(ratios, 0.9))
 
 
-def _checked(twin: Twin, trajectories: Trajectories, rate: float | None, draws: int) -> int:
+def _check(twin: Twin, trajectories: Trajectories, rate: float | None, draws: int) -> int:
     """The stride of the comparison in samples; InputError for what cannot be compared."""
     stride = checked_stride(twin, trajectories, rate, "trajectories")
     require(
@@ -240,8 +238,16 @@ class _Ensemble:
         seen = self.members.observed[:, :: self.stride][:, self.seen]
         return seen.astype(np.float64)
 
-    def scores(self, rng: np.random.Generator) -> dict[str, Any]:
-        """The fields of `Fidelity` for one trajectory, except those per segment."""
+    def scores(self, rng: np.random.Generator, *, reference: int = 99) -> dict[str, Any]:
+        """The fields of `Fidelity` for one trajectory, except those per segment.
+
+        Parameters
+        ----------
+        reference : int, default 99
+            Draws per trajectory whose PIT is computed as that of a perfect generator: p-values of
+            0.01.
+
+        """
         every = slice(None, None, self.stride)
         observed = self.members.observed[:, every]
         residual = self.members.residual[: INFERRED + 1, : self.one.lengths[0] : self.stride]
@@ -253,7 +259,7 @@ class _Ensemble:
             "bands": quantiles(observed[1:]),
             "crps": score,
             "energy": energy,
-            "pit": pit_histograms(self.values, members=REFERENCE + 1, bins=BINS, rng=rng),
+            "pit": pit_histograms(self.values, members=reference + 1, bins=BINS, rng=rng),
             "features": _features(residual),
         }
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,18 +12,16 @@ from numpy.typing import NDArray
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.evaluation.fidelity.latents import shown_latents
+from retwin.evaluation.fidelity.stored import StoredArrays
 from retwin.progress import Progress, tracked
 from retwin.scores.distributions import quantiles
-from retwin.serialisation.files import write_atomically
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.residual import infer_discrepancy, segment
 from retwin.update.training_range import checked_once
 
-_ARRAYS = ("ids", "bands", "z", "deviation", "times")
-
 
 @dataclass(frozen=True, eq=False)
-class Overlay:
+class Overlay(StoredArrays):
     """Predictive overlay of n trajectories at P samples of d outputs, with at most M segments.
 
     Attributes
@@ -49,20 +46,6 @@ class Overlay:
     z: NDArray
     deviation: NDArray
     times: NDArray
-
-    def save(self, file: str | Path) -> None:
-        """Write an NPZ file; `load` reads it."""
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        latent = np.array([self.latent.names, self.latent.units])
-        with write_atomically(Path(file)) as part:
-            np.savez_compressed(part, allow_pickle=False, latent=latent, **arrays)
-
-    @classmethod
-    def load(cls, file: str | Path) -> Overlay:
-        """Read what `save` wrote."""
-        with np.load(file, allow_pickle=False) as found:
-            latent = Channels(*(tuple(row.tolist()) for row in found["latent"]))
-            return cls(latent, **{name: found[name] for name in _ARRAYS})
 
     @classmethod
     def concatenate(cls, parts: Sequence[Overlay]) -> Overlay:

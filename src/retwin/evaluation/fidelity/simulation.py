@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
+from retwin.evaluation.fidelity.stored import StoredArrays
 from retwin.progress import Progress, tracked
 from retwin.scores.distributions import central_band, crps, inside, log_score, quantiles
-from retwin.serialisation.files import write_atomically
 from retwin.twins.twin import Twin
 from retwin.update.training_range import checked_once
 
-_ARRAYS = ("ids", "observed", "mean", "bands", "crps", "nll")
-
 
 @dataclass(frozen=True, eq=False)
-class Simulation:
+class Simulation(StoredArrays):
     """n records of T samples in d outputs, each simulated many times from its commands alone.
 
     Attributes
@@ -76,24 +73,8 @@ class Simulation:
         """Simulations of several folds as one, in the order of `ids`."""
         names = np.concatenate([part.ids for part in parts]).tolist()
         order = [names.index(name) for name in ids.tolist()]
-        return cls(
-            **{
-                name: np.concatenate([getattr(part, name) for part in parts])[order]
-                for name in _ARRAYS
-            }
-        )
-
-    def save(self, file: str | Path) -> None:
-        """Write an NPZ file; `load` reads it."""
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        with write_atomically(Path(file)) as part:
-            np.savez_compressed(part, allow_pickle=False, **arrays)
-
-    @classmethod
-    def load(cls, file: str | Path) -> Simulation:
-        """Read what `save` wrote."""
-        with np.load(file, allow_pickle=False) as found:
-            return cls(**{name: found[name] for name in _ARRAYS})
+        arrays = ([getattr(part, each.name) for part in parts] for each in fields(cls))
+        return cls(*(np.concatenate(each)[order] for each in arrays))
 
 
 @checked_once

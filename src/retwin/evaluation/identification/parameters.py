@@ -17,19 +17,12 @@ from retwin.update.identification.posterior import Posterior
 
 NEAR = 0.01
 """Distance from a bound, in widths of the range, within which draws count as on it."""
-CROWDED = 0.1
-"""Share of the draws near a bound from which a parameter counts as at the bound; of a uniform
-distribution it is 0.01."""
-OPEN = 0.8
-"""Posterior standard deviation, over that of the prior, from which a direction counts as open."""
 WIDEST = 0.5
 """Share of a range that the 95 % interval of an identified parameter covers at most: the
 measurements then halve what was known before."""
 MARGIN, SMALLEST = 5.0, 0.2
 """Width of what simulations of a state surrogate cover, over that of an interval, since corrected
 dynamics move parameters by more than their errors; and the least share of a range."""
-SMALL = 0.1
-"""Least component of a direction that is listed."""
 Basis = Literal["trajectories", "samples", "posterior", "none"]
 """What standard errors rest on: differences between trajectories, samples whose residuals correlate
 as those of a first-order autoregression, or draws from the posterior."""
@@ -171,19 +164,31 @@ def _of_fit(before: ParametricTwin, found: Updated) -> Uncertainty:
     return Uncertainty(made, local.correlation, directions, basis)
 
 
-def _of_posterior(before: ParametricTwin, found: Posterior) -> Uncertainty:
-    """By the draws."""
+def _of_posterior(
+    before: ParametricTwin, found: Posterior, *, crowded: float = 0.1, open_from: float = 0.8
+) -> Uncertainty:
+    """By the draws.
+
+    Parameters
+    ----------
+    crowded : float, default 0.1
+        Share of the draws near a bound from which a parameter counts as at the bound; of a uniform
+        distribution it is 0.01.
+    open_from : float, default 0.8
+        Posterior standard deviation, over that of the prior, from which a direction counts as open.
+
+    """
     low, high = before.bounds
     width = high - low
     scaled = (found.samples - low) / width
     deviation = scaled.std(axis=0)
     near = np.stack([(scaled < NEAR).mean(axis=0), (scaled > 1 - NEAR).mean(axis=0)])
     sides = [
-        ("low", "high")[int(share.argmax())] if share.max() > CROWDED else "" for share in near.T
+        ("low", "high")[int(share.argmax())] if share.max() > crowded else "" for share in near.T
     ]
     variances, vectors = np.linalg.eigh(np.atleast_2d(np.cov(scaled.T)))
     along = np.sqrt(np.maximum(variances, 0.0))
-    directions = _directions(before.names, vectors.T, along, OPEN * UNIFORM)
+    directions = _directions(before.names, vectors.T, along, open_from * UNIFORM)
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.atleast_2d(np.corrcoef(scaled.T))
     made = estimates(
@@ -191,7 +196,7 @@ def _of_posterior(before: ParametricTwin, found: Posterior) -> Uncertainty:
         found.samples.mean(axis=0),
         deviation * width,
         np.quantile(found.samples, [0.025, 0.975], axis=0).T,
-        deviation < OPEN * UNIFORM,
+        deviation < open_from * UNIFORM,
         sides,
         bounded=True,
     )
@@ -242,13 +247,20 @@ def estimates(
 
 
 def _directions(
-    names: Sequence[str], vectors: NDArray, along: NDArray, limit: float
+    names: Sequence[str], vectors: NDArray, along: NDArray, limit: float, *, small: float = 0.1
 ) -> tuple[Direction, ...]:
-    """Directions in rows, the best determined first."""
+    """Directions in rows, the best determined first.
+
+    Parameters
+    ----------
+    small : float, default 0.1
+        Least component of a direction that is listed.
+
+    """
     made = []
     for i in np.argsort(along, kind="stable"):
         vector = vectors[i] * (1.0 if vectors[i][np.argmax(np.abs(vectors[i]))] >= 0 else -1.0)
-        shown = [j for j in np.argsort(-np.abs(vector)) if abs(vector[j]) > SMALL]
+        shown = [j for j in np.argsort(-np.abs(vector)) if abs(vector[j]) > small]
         components = {names[j]: float(vector[j]) for j in shown}
         made.append(Direction(components, float(along[i]), bool(along[i] >= limit)))
     return tuple(made)

@@ -13,8 +13,6 @@ from retwin.scores.residuals import autocorrelation, cross_correlation, ljung_bo
 
 NORMAL = 1.959964
 """The 97.5 % quantile of the normal distribution, which the limits of correlations contain."""
-NEGLIGIBLE = 1e-6
-"""RMS of a residual, over the standard deviation of the output, below which it is rounding."""
 
 
 @dataclass(frozen=True)
@@ -64,15 +62,24 @@ class ResidualTest:
     inputs: tuple[InputTest, ...]
 
 
-def residual_tests(residual: NDArray, measured: Trajectories) -> tuple[ResidualTest, ...]:
-    """Tests of the residuals (n, T, d_y) of each output, NaN where nothing was measured."""
+def residual_tests(
+    residual: NDArray, measured: Trajectories, *, negligible: float = 1e-6
+) -> tuple[ResidualTest, ...]:
+    """Tests of the residuals (n, T, d_y) of each output, NaN where nothing was measured.
+
+    Parameters
+    ----------
+    negligible : float, default 1e-6
+        RMS of a residual, over the standard deviation of the output, below which it is rounding.
+
+    """
     made = []
     for channel, name in enumerate(measured.outputs.names):
         own = residual[..., channel]
         seen = np.isfinite(own)
         spread = float(measured.observed[..., channel][seen].std()) if seen.any() else 0.0
         error = float(np.sqrt(np.mean(own[seen] ** 2))) if seen.any() else 0.0
-        if error <= NEGLIGIBLE * max(spread, 1e-300):
+        if error <= negligible * max(spread, 1e-300):
             made.append(ResidualTest(name, float("nan"), float("nan"), ()))
             continue
         found = autocorrelation(own)

@@ -28,8 +28,6 @@ from retwin.update.identification.posterior import Posterior
 
 BEGIN = 10
 """The begin of a trajectory is its part by this number."""
-MAX_BLOCKS = 20
-"""Blocks into which held-out records are divided for an interval, at most."""
 Part = Literal["identification", "validation"]
 Split = Literal["trajectories", "time", "none"]
 
@@ -230,7 +228,7 @@ def validate_identification(
     simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]] = {}
     for part, measured in parts.items():
         checked_stride(before, measured, None, part)
-        simulated[part] = _simulated(before, mean, measured, used, horizon, seed)
+        simulated[part] = _simulate(before, mean, measured, used, horizon, seed)
     last = simulated["validation" if held_out is not None else "identification"]
     return Identification(
         twin=mean,
@@ -243,7 +241,7 @@ def validate_identification(
     )
 
 
-def _simulated(
+def _simulate(
     before: ParametricTwin,
     after: ParametricTwin,
     measured: Trajectories,
@@ -339,18 +337,24 @@ def _rms(before: NDArray, after: NDArray) -> RMSError:
     return RMSError(first, second, change, interval, number, int(seen.sum()))
 
 
-def _groups(residual: NDArray) -> NDArray:
+def _groups(residual: NDArray, *, max_blocks: int = 20) -> NDArray:
     """A group for each sample (n, T): its trajectory, or a block of time of it.
 
     Where there are fewer than five trajectories, their measured parts are divided into blocks that
     are longer than the residuals correlate, so that blocks are nearly independent.
+
+    Parameters
+    ----------
+    max_blocks : int, default 20
+        Blocks into which held-out records are divided for an interval, at most.
+
     """
     seen = np.isfinite(residual)
     rows = np.broadcast_to(np.arange(len(residual))[:, None], residual.shape)
     if len(residual) >= MIN_GROUPS:
         return rows
     place = np.cumsum(seen, axis=1) - 1
-    length = max(decorrelated_after(residual), int(seen.sum()) // MAX_BLOCKS, 1)
+    length = max(decorrelated_after(residual), int(seen.sum()) // max_blocks, 1)
     blocks = np.maximum(seen.sum(axis=1) // length, 1)
     starts = np.concatenate([[0], np.cumsum(blocks)[:-1]])
     within = np.minimum(np.maximum(place, 0) // length, blocks[:, None] - 1)

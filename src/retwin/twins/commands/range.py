@@ -39,8 +39,6 @@ MARGIN_OF_ONE = 3.0
 most: 1 - 0.05 ** (1 / n), for uniform values."""
 LEAKAGE = 2.0
 """Half the width of a sine's peak in the spectrum of a Hann window, in frequency steps."""
-MAX_SPECTRA = 1000
-"""Largest number of trajectories whose spectra are computed, evenly chosen."""
 
 
 @dataclass(frozen=True)
@@ -300,7 +298,14 @@ def part_of(count: int) -> Iterator[None]:
         _WHOLE.reset(token)
 
 
-def chosen_for_spectra(count: int) -> NDArray:
-    """Indices of at most a thousand trajectories, evenly chosen; of fewer in `part_of` a set."""
-    share = min(1.0, MAX_SPECTRA / max(count, _WHOLE.get(), 1))
+def chosen_for_spectra(count: int, *, max_spectra: int = 1000) -> NDArray:
+    """Indices of at most a thousand trajectories, evenly chosen; of fewer in `part_of` a set.
+
+    Parameters
+    ----------
+    max_spectra : int, default 1000
+        Largest number of trajectories whose spectra are computed, evenly chosen.
+
+    """
+    share = min(1.0, max_spectra / max(count, _WHOLE.get(), 1))
     return np.unique(np.linspace(0, count - 1, ceil(share * count)).round().astype(int))

@@ -17,8 +17,6 @@ BAND_MARGIN = 1.2
 """Highest frequency of multisines, in that of the record: the surrogate is needed up to there."""
 MAX_SAMPLES = 2048
 """Largest number of samples of a multisine; a longer record is cut into parts of that length."""
-RESTING = 0.3
-"""Least share of the time that commands with segments are at rest, on average."""
 DURATIONS = (0.1, 0.5, 0.9)
 """Quantiles of the durations of a record's ramps that the ramps of drawn commands have."""
 CORNER_SHARE = 0.95
@@ -53,7 +51,7 @@ def sampler_from(
     """
     values = np.asarray(commands, np.float64)
     contained = CommandRange.of(values, rate)
-    low, high = _wider(contained, limits)
+    low, high = _widen(contained, limits)
     segments = Segments.from_commands(values)
     if moves_and_rests(segments):
         return _ramps(values, rate, segments, low, high)
@@ -84,7 +82,7 @@ def sampler_from(
     )
 
 
-def _wider(contained: CommandRange, limits: Limits | None) -> tuple[NDArray, NDArray]:
+def _widen(contained: CommandRange, limits: Limits | None) -> tuple[NDArray, NDArray]:
     """The range of the record (d_u,) with a margin, within the twin's limits."""
     low, high = np.array(contained.low), np.array(contained.high)
     size = np.maximum(np.abs(low), np.abs(high))
@@ -95,12 +93,19 @@ def _wider(contained: CommandRange, limits: Limits | None) -> tuple[NDArray, NDA
     return np.maximum(wide[0], limits.low), np.minimum(wide[1], limits.high)
 
 
-def moves_and_rests(segments: Segments) -> bool:
-    """Whether the commands of a record have several segments, with rest in them."""
+def moves_and_rests(segments: Segments, *, resting: float = 0.3) -> bool:
+    """Whether the commands of a record have several segments, with rest in them.
+
+    Parameters
+    ----------
+    resting : float, default 0.3
+        Least share of the time that commands with segments are at rest, on average.
+
+    """
     if segments.max_count < 2:
         return False
     rest, whole = segments.stop - segments.settle, segments.stop - segments.start
-    return bool(rest[segments.valid].sum() >= RESTING * whole[segments.valid].sum())
+    return bool(rest[segments.valid].sum() >= resting * whole[segments.valid].sum())
 
 
 def _ramps(

@@ -39,7 +39,9 @@ ELEMENTWISE: dict[str, Callable[..., Node]] = {
 SHAPES: dict[str, Callable[..., Any]] = {
     "view": lambda a, shape: a.reshape(shape),
     "_unsafe_view": lambda a, shape: a.reshape(shape),
-    "expand": lambda a, shape: np.broadcast_to(a, [_kept(a, shape, i) for i in range(len(shape))]),
+    "expand": lambda a, shape: np.broadcast_to(
+        a, [_keep_length(a, shape, i) for i in range(len(shape))]
+    ),
     "permute": lambda a, axes: a.transpose(axes),
     "t": lambda a: a.T,
     "transpose": lambda a, first, second: a.swapaxes(first, second),
@@ -215,7 +217,7 @@ def _axes(axis: Any) -> Any:
     return tuple(axis) if isinstance(axis, list) else axis
 
 
-def _kept(a: NDArray, shape: Sequence[int], i: int) -> int:
+def _keep_length(a: NDArray, shape: Sequence[int], i: int) -> int:
     """The length of an axis that is broadcast, where -1 keeps it."""
     return a.shape[i - len(shape) + a.ndim] if shape[i] == -1 else shape[i]
 

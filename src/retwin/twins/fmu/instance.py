@@ -24,11 +24,6 @@ DISCARD, FATAL = STATUS.index("discard"), STATUS.index("fatal")
 LAST_TIME, TERMINATED = 2, 3
 """The kinds of status in FMI 2 that give the last successful time in s, and whether the FMU has
 ended its simulation."""
-ROUNDING = 1e-9
-"""Times in samples that are this close below a whole number count as that number: they round."""
-SAME = 1e-6
-"""Largest difference, relative to the largest output, between runs of one trajectory that count as
-equal in different instances, so that an FMU whose last digits vary needs no process per run."""
 
 Start = Mapping[str, float | str]
 
@@ -159,25 +154,34 @@ class Instance:
         elif self.first and not self.moved and not np.array_equal(outputs, self.first[2]):
             self.moved = self.unchecked = True
 
-    def _renew(self) -> None:
-        """Restore the initial state: by a reset, or by another instance or process."""
+    def _renew(self, *, same: float = 1e-6) -> None:
+        """Restore the initial state: by a reset, or by another instance or process.
+
+        Parameters
+        ----------
+        same : float, default 1e-6
+            Largest difference, relative to the largest output, between runs of one trajectory that
+            count as equal in different instances, so that an FMU whose last digits vary needs no
+            process per run.
+
+        """
         self.message = ""
         if self.fresh:
             return
         if self.spent:
             raise Retired
         if self.reuse and self.sound and self._reset():
-            if self._restored(self._reset, 0.0):
+            if self._check_restored(self._reset, 0.0):
                 return
             self.reuse, self.forgets = False, True
         self._another()
-        if not self._restored(self._another, SAME):
+        if not self._check_restored(self._another, same):
             raise Retired(
                 "runs differ with what their process ran before, even in a new instance; every run "
                 "has a process of its own"
             )
 
-    def _restored(self, renew: Callable[[], bool], tolerance: float) -> bool:
+    def _check_restored(self, renew: Callable[[], bool], tolerance: float) -> bool:
         """Whether the first trajectory has the same outputs again, if that is to be checked."""
         if self.first is None or not self.unchecked:
             return True
@@ -305,11 +309,18 @@ class Instance:
         slave.exitInitializationMode()
         return begin
 
-    def _table(self, commands: NDArray) -> NDArray:
+    def _table(self, commands: NDArray, *, rounding: float = 1e-9) -> NDArray:
         """Inputs (K, d_u) at all communication points.
 
         Continuous inputs are linear between samples, others are held; an input with a rate of its
         own is sampled at that rate and held.
+
+        Parameters
+        ----------
+        rounding : float, default 1e-9
+            Times in samples that are this close below a whole number count as that number: they
+            round.
+
         """
         samples = np.arange(len(commands))
         points = np.arange((len(commands) - 1) * self.job.substeps + 1) / self.job.substeps
@@ -318,10 +329,10 @@ class Instance:
             at = points
             if scalar.name in self.job.rates:
                 ratio = self.job.rate / self.job.rates[scalar.name]
-                at = np.floor(points / ratio + ROUNDING) * ratio
+                at = np.floor(points / ratio + rounding) * ratio
             kind = scalar.variable
             if kind.type not in NUMBERS or kind.variability != "continuous":
-                at = np.floor(at + ROUNDING)
+                at = np.floor(at + rounding)
             table[:, column] = np.interp(at, samples, commands[:, column])
         return table
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from retwin.checks import needs_extra, require
 from retwin.data.trajectories import Channels
-from retwin.errors import InputError, brief
+from retwin.errors import InputError
+from retwin.serialisation.files import refusing
 from retwin.serialisation.sizes import Budget
 from retwin.twins.limits import Limits
 
@@ -27,10 +28,6 @@ WHOLE = (
 SCALARS = (*NUMBERS, *WHOLE, "Boolean")
 HIDDEN = (("output", "local"), ("output", "calculatedParameter"))
 """Pairs of what a channel is and another causality that it may have if it is named."""
-UNLIMITED = 1e30
-"""Magnitude above which a declared limit counts as none: tools write the largest float for it."""
-MAX_SCALARS = 1_000_000
-"""Largest number of scalars that one array may hold, since a file of some bytes may declare any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +68,17 @@ class Scalar:
         return _limit(low, -np.inf), _limit(high, np.inf)
 
 
-def _limit(declared: Any, none: float) -> float:
-    """A declared limit as a number; `none` where it is none."""
+def _limit(declared: Any, none: float, *, unlimited: float = 1e30) -> float:
+    """A declared limit as a number; `none` where it is none.
+
+    Parameters
+    ----------
+    unlimited : float, default 1e+30
+        Magnitude above which a declared limit counts as none: tools write the largest float for it.
+
+    """
     value = none if declared is None else float(declared)
-    return value if abs(value) < UNLIMITED else none
+    return value if abs(value) < unlimited else none
 
 
 def _fmpy() -> Any:
@@ -110,20 +114,13 @@ def read_description(path: Path) -> Any:
     if not path.is_file() or not zipfile.is_zipfile(path):
         got = "which is no zip file" if path.is_file() else "which is not there"
         raise refuse("an FMU, a zip file", got, "give the path of a .fmu file")
-    try:
+    expected = "an FMU with a readable modelDescription.xml"
+    with refusing(path.name, expected=expected, remedy="export it again"):
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
             Budget(path.name).take(archive.getinfo("modelDescription.xml").file_size)
         # Not validated against FMI's schema: many FMUs that run break it in some small way.
         description = fmpy.read_model_description(path, validate=False)
-    except InputError:
-        raise
-    except Exception as error:  # FMPy raises nothing more special
-        raise refuse(
-            "an FMU with a readable modelDescription.xml",
-            f"which has none ({brief(error)})",
-            "export it again",
-        ) from None
     if description.coSimulation is None or description.fmiMajorVersion == 1:
         raise refuse(
             "an FMU for co-simulation, FMI 2.0 or 3.0",
@@ -162,19 +159,11 @@ def extract(path: Path, folder: str) -> None:
         It cannot be unpacked, or the disk has no room for it.
 
     """
-    try:
+    expected, remedy = "an FMU that can be unpacked", "get or make the file again"
+    with refusing(path.name, expected=expected, remedy=remedy):
         with zipfile.ZipFile(path) as archive:
             Budget(path.name, disk=folder).take(sum(e.file_size for e in archive.infolist()))
         _fmpy().extract(path, folder)
-    except InputError:
-        raise
-    except Exception as error:  # FMPy raises nothing more special
-        raise InputError(
-            "path",
-            expected="an FMU that can be unpacked",
-            got=f"{path.name} ({brief(error)})",
-            remedy="get or make the file again",
-        ) from None
 
 
 def find_scalars(description: Any, argument: str, names: Sequence[str]) -> list[Scalar]:
@@ -233,15 +222,23 @@ def find_scalars(description: Any, argument: str, names: Sequence[str]) -> list[
     return chosen
 
 
-def _scalars(variable: Any, argument: str) -> Iterator[Scalar]:
-    """The elements of an array; of another variable itself."""
+def _scalars(variable: Any, argument: str, *, max_scalars: int = 1_000_000) -> Iterator[Scalar]:
+    """The elements of an array; of another variable itself.
+
+    Parameters
+    ----------
+    max_scalars : int, default 1_000_000
+        Largest number of scalars that one array may hold, since a file of some bytes may declare
+        any.
+
+    """
     if not variable.shape:
         yield Scalar(variable.name, variable)
         return
     require(
-        prod(variable.shape) <= MAX_SCALARS,
+        prod(variable.shape) <= max_scalars,
         argument,
-        expected=f"arrays of at most {MAX_SCALARS} numbers",
+        expected=f"arrays of at most {max_scalars} numbers",
         got=f"{variable.name!r} of shape {variable.shape}",
         remedy="export the FMU with smaller arrays",
     )

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import positive, require
+from retwin.checks import at_least, positive, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.times import sample_rate
@@ -172,12 +172,9 @@ class FMUTwin:
         description = read_description(path)
         inputs_found = find_scalars(description, "inputs", inputs)
         outputs_found = find_scalars(description, "outputs", outputs)
-        require(
-            outputs_found,
-            "outputs",
-            expected="at least one variable that is an output and a number",
-            got=f"{path.name}, which has none",
-            remedy="name local variables as outputs, or export the FMU with outputs",
+        remedy = "name local variables as outputs, or export the FMU with outputs"
+        at_least(
+            "outputs", outputs_found, 1, "variable that is an output and a number", remedy=remedy
         )
         twin = cls(
             path.resolve(),

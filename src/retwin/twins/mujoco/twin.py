@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import finite, positive, require, whole
+from retwin.checks import finite, one_of, positive, whole
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.times import sample_rate
@@ -308,11 +308,6 @@ class MuJoCoTwin:
         names = [self.model.key(i).name for i in range(self.model.nkey)]
         if not self.keyframe:
             return 0 if names else -1
-        require(
-            self.keyframe in names,
-            "keyframe",
-            expected=f"one of the model's: {', '.join(names) or 'it has none'}",
-            got=repr(self.keyframe),
-            remedy="check the spelling, or leave it out",
-        )
+        remedy = "check the spelling, or leave it out"
+        one_of("keyframe", self.keyframe, names, remedy=remedy)
         return names.index(self.keyframe)
