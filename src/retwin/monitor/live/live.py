@@ -20,8 +20,10 @@ from retwin.monitor.live.status import AssetStatus, Received
 from retwin.monitor.live.stream_machine import StreamMachine, Work, step
 from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
+from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.trajectories import TrajectoryMonitor
 from retwin.monitor.store.audit import Entry
+from retwin.monitor.store.limits import Limits
 from retwin.monitor.store.samples import SECOND, Samples, Trajectory
 from retwin.monitor.store.store import Store
 from retwin.monitor.store.updates import LATEST, Asset, Update, one_asset
@@ -92,16 +94,29 @@ class Live:
     def add(self, name: str, twin: str, settings: Mapping[str, Any] | None = None) -> None:
         """Watch a machine by the active version of a twin; one that is watched so stays as it is.
 
+        Parameters
+        ----------
+        name, twin : str
+            Names of the machine and of its twin.
+        settings : mapping, optional
+            JSON values that are kept; of these, `limits` are the smallest and the largest possible
+            value of channels, by their names. Another value is logged, and not used.
+
         Raises
         ------
         InputError
-            The twin has no active version, or the machine has other channels.
+            The twin has no active version, the machine has other channels, or limits are those of
+            another channel, or of a machine that is watched trajectory by trajectory.
 
         """
         with self._lock:
             version = self._active(twin)
             monitor, _ = self._monitor(twin, version)
             channels = len(monitor.twin.inputs) + len(monitor.twin.outputs)
+            if limits := (settings or {}).get("limits", {}):
+                Limits.of(monitor.twin, limits)
+                remedy = "leave out its limits: implausible trajectories are found without them"
+                instance("limits", monitor, Monitor, remedy=remedy)
             asset = Asset(name, channels, {**(settings or {}), "twin": twin}, version)
             known = {each.name: each for each in self.store.assets()}.get(name)
             if asset != known:

@@ -120,6 +120,11 @@ class Machine(ABC, Generic[Watching]):
         """How the sample rate differs from the twin's; "" if it does not."""
         return ""
 
+    @property
+    def impossible(self) -> str:
+        """Which channels have had impossible values; "" for none."""
+        return ""
+
     @abstractmethod
     def recent(self) -> Recent:
         """The newest samples, or scores of the newest trajectories."""

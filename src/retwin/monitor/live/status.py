@@ -51,6 +51,8 @@ class AssetStatus:
         have left their range in calibration.
     rate : str
         How the sample rate differs from the twin's; "" if it does not.
+    impossible : str
+        Which channels have had impossible values; "" for none.
     counts : dict of str to int
         Samples since the program was started, by what was done with them.
 
@@ -67,6 +69,7 @@ class AssetStatus:
     void: bool
     outside: bool
     rate: str
+    impossible: str
     counts: dict[str, int]
 
     @classmethod
@@ -84,5 +87,6 @@ class AssetStatus:
             machine.void,
             machine.outside,
             machine.rate,
+            machine.impossible,
             vars(machine.counts).copy(),
         )

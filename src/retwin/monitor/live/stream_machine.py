@@ -18,6 +18,7 @@ from retwin.monitor.live.layout import Layout
 from retwin.monitor.live.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.watched import Alarm, Ending, Watched
+from retwin.monitor.store.limits import Limits
 from retwin.monitor.store.samples import SECOND, Samples
 from retwin.monitor.store.updates import EARLIEST, Asset
 
@@ -34,7 +35,9 @@ PLACES = 4 * PART
 """Places, most of them perhaps without a sample, from which on they are stepped before others are
 taken: that bounds the memory for any times of the samples."""
 WINDOW, TOLERATED = 100, 20
-"""Places of a check of the sample rate, and how many may be missing or have further samples."""
+"""Places of a check of the sample rate, and how many may be missing or have further samples; as
+many places without an impossible value of a channel are needed until it counts as possible again.
+"""
 BEHIND = 10
 """Late samples in a row from which on the clock of the machine counts as set back."""
 
@@ -89,6 +92,9 @@ class StreamMachine(Machine[Monitor]):
         self._wrong = [0, 0, 0]
         """The newest full window if its rate was another one than the twin's."""
         self._late = 0
+        self._limits = Limits.of(monitor.twin, asset.settings.get("limits", {}))
+        self._doubtful = np.zeros(asset.channels)
+        """Places until each channel counts as possible again; 0 for one that is."""
         self._recent: deque[tuple[NDArray, ...]] = deque()
         self._kept = 0
 
@@ -100,6 +106,11 @@ class StreamMachine(Machine[Monitor]):
             return ""
         rate = self.monitor.twin.rate
         return f"{rate * (places - absent + further) / places:.4g} Hz instead of {rate:.4g} Hz"
+
+    @property
+    def impossible(self) -> str:
+        """Which channels have had impossible values; "" for none."""
+        return "; ".join(map(self._limits.text, np.flatnonzero(self._doubtful).tolist()))
 
     @property
     def stepped_time(self) -> int:
@@ -226,7 +237,7 @@ class StreamMachine(Machine[Monitor]):
         return {
             "stream": np.array(own, dtype=np.int64),
             "monitor": self._state,
-            "status": np.array([self.evidence, *self._wrong], dtype=float),
+            "status": np.array([self.evidence, *self._wrong, *self._doubtful], dtype=float),
             "digest": self.layout.digest,
         }
 
@@ -243,8 +254,9 @@ class StreamMachine(Machine[Monitor]):
         self._state, self._begins = arrays["monitor"], False
         before = self.layout.state(self._state[None])
         self.void, self.event = bool(before.void[0]), bool(before.course.event[0] >= 0)
-        self.evidence, *wrong = arrays["status"].tolist()
-        self._wrong = [int(each) for each in wrong]
+        self.evidence, *more = arrays["status"].tolist()
+        self._wrong = [int(each) for each in more[:3]]
+        self._doubtful = np.array(more[3:] or self._doubtful)  # states of before have no limits
         return True
 
     def _moment(self, work: Work, place: int) -> int:
@@ -273,7 +285,7 @@ class StreamMachine(Machine[Monitor]):
                 return self._further() if later else self._too_late(moment)
             begins = place - self._farthest > self._gap
         if begins:
-            if not np.isfinite(row[: self._commands]).all():
+            if not np.isfinite(self._limits.kept(row)[: self._commands]).all():
                 return "unknown"
             self._begin(moment)
         place = self._place(moment)
@@ -317,9 +329,22 @@ class StreamMachine(Machine[Monitor]):
             found = self._pending.pop(place, None)
             if found is None and self._farthest - place < wait:
                 return
-            self._rows.append(self._missing if found is None else found[1])
+            self._rows.append(self._measured(place, self._missing if found is None else found[1]))
             self._done = place
             self._checked_rate(place, missing=found is None)
+
+    def _measured(self, place: int, row: NDArray) -> NDArray:
+        """The values of a place that are possible; when others begin and end is logged."""
+        outside, before = self._limits.outside(row), self._doubtful
+        self._doubtful = np.where(outside, WINDOW, np.maximum(before - 1, 0))
+        for channel in np.flatnonzero((before > 0) != (self._doubtful > 0)).tolist():
+            text = f"{self._limits.names[channel]} is within its limits again"
+            if outside[channel]:
+                text = f"impossible: {self._limits.text(channel, row[channel])}; it is not used"
+            assert self._origin is not None
+            moment = self._origin + round(place * self._period)
+            self._log("event", moment, what="impossible", text=text)
+        return self._limits.kept(row)
 
     def _complete(self) -> None:
         """Make work of the places that were passed."""

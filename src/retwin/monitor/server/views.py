@@ -177,6 +177,7 @@ class Views:
             "alarm": alarm is not None,
             "void": status.void,
             "stopped": status.time is not None and idle > silent,
+            "impossible": bool(status.impossible),
             "rate": bool(status.rate),
             "outside": status.outside,
             "ok": True,
@@ -192,6 +193,7 @@ class Views:
             "alarm": None if alarm is None else self._explained(alarm, twins),
             "state": next(name for name, holds in states.items() if holds),
             "rate": status.rate,
+            "impossible": status.impossible,
             "idle": idle,
             "counts": status.counts,
         }
@@ -246,7 +248,7 @@ def _drawn(inputs: Named, outputs: Named, recent: Recent, part: slice) -> dict[s
     }
 
 
-ORDER = ("alarm", "void", "stopped", "rate", "outside", "ok")
+ORDER = ("alarm", "void", "impossible", "stopped", "rate", "outside", "ok")
 """The states of assets, the worst first."""
 
 
