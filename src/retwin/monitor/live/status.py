@@ -51,10 +51,10 @@ class AssetStatus:
         have left their range in calibration.
     rate : str
         How the sample rate differs from the twin's; "" if it does not.
-    impossible : str
-        Which channels have had impossible values; "" for none.
     counts : dict of str to int
         Samples since the program was started, by what was done with them.
+    impossible : str
+        Which channels have had impossible values; "" for none.
 
     """
 
@@ -69,24 +69,19 @@ class AssetStatus:
     void: bool
     outside: bool
     rate: str
-    impossible: str
     counts: dict[str, int]
+    impossible: str = ""
 
     @classmethod
     def of(cls, machine: Machine[Any], arl: float) -> AssetStatus:
         """The status of a machine whose alarms have that threshold."""
+        same = ("alarms", "last_alarm", "event", "void", "outside", "rate", "impossible")
         return cls(
-            machine.asset.name,
-            machine.asset.settings["twin"],
-            machine.asset.version or 0,
-            machine.newest,
-            machine.evidence / arl,
-            machine.alarms,
-            machine.last_alarm,
-            machine.event,
-            machine.void,
-            machine.outside,
-            machine.rate,
-            machine.impossible,
-            vars(machine.counts).copy(),
+            asset=machine.asset.name,
+            twin=machine.asset.settings["twin"],
+            version=machine.asset.version or 0,
+            time=machine.newest,
+            ratio=machine.evidence / arl,
+            counts=vars(machine.counts).copy(),
+            **{name: getattr(machine, name) for name in same},
         )

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.watched import Alarm, Ending, Watched
 from retwin.monitor.store.limits import Limits
 from retwin.monitor.store.samples import SECOND, Samples
-from retwin.monitor.store.updates import EARLIEST, Asset
+from retwin.monitor.store.updates import EARLIEST, Asset, Update
 
 ALARM = ("sample", "output", "change", "evidence", "machine")
 """What the log has of an alarm, beside its time and that of its event."""
@@ -72,7 +71,6 @@ class StreamMachine(Machine[Monitor]):
         super().__init__(asset, monitor)
         rate = monitor.twin.rate
         self.layout = layout
-        self.entries: list[tuple[str, dict[str, Any]]] = []
         self.changed = False
         self._period = SECOND / rate
         self._wait = DEFAULT_WAIT if wait is None else int(np.ceil(wait * rate))
@@ -196,13 +194,13 @@ class StreamMachine(Machine[Monitor]):
                 self.last_alarm = moment
             data = {name: getattr(alarm, name) for name in ALARM}
             event = self._moment(work, alarm.event)
-            self._log("alarm" if alarm.promised else "remark", moment, **data, event=event)
+            self.log("alarm" if alarm.promised else "remark", moment, **data, event=event)
         for ending in endings:
             moment, event = (self._moment(work, each) for each in (ending.sample, ending.event))
-            self._log("end", moment, event=event, how=ending.how)
+            self.log("end", moment, event=event, how=ending.how)
         void = found["void"]
         if void.any() and not self.void:
-            self._log("void", int(times[int(np.argmax(void))]))
+            self.log("void", int(times[int(np.argmax(void))]))
         self.void = bool(void[-1])
         commands, measured = np.split(work.values, [self._commands], axis=1)
         predicted = (found["mean"], found["deviation"], found["evidence"])
@@ -221,18 +219,21 @@ class StreamMachine(Machine[Monitor]):
         commands, measured, mean, deviation, evidence = more
         return Recent(times, commands, measured, mean, deviation, evidence)
 
-    def new_samples(self) -> Samples:
-        """Samples that are not stored yet."""
+    def update(self) -> Update | None:
+        """Samples that are not stored yet, and the state after those that were stepped."""
+        if not self._new and not self.changed:
+            return None
         times = np.array(list(self._new), dtype=np.int64)
         rows = np.array(list(self._new.values())).reshape(-1, self.asset.channels)
-        return Samples(self.asset.name, times, rows)
+        state = self._arrays() if self.changed else None
+        return Update(self.asset.name, times, rows, state, self.newest or 0)
 
     def committed(self) -> None:
         """Everything is stored."""
-        self._new, self.entries, self.changed = {}, [], False
+        super().committed()
+        self._new, self.changed = {}, False
 
-    def arrays(self) -> dict[str, NDArray]:
-        """All that must be stored, beside the samples."""
+    def _arrays(self) -> dict[str, NDArray]:
         own = (self._origin, self._done, self.newest, self.asset.version, *self._window)
         return {
             "stream": np.array(own, dtype=np.int64),
@@ -242,7 +243,7 @@ class StreamMachine(Machine[Monitor]):
         }
 
     def restore(self, arrays: Mapping[str, NDArray]) -> bool:
-        """Continue where `arrays` was stored; False if another version or monitor watched."""
+        """Continue where a state was stored; False if another version or monitor watched."""
         if not {"stream", "status"} <= arrays.keys():  # of a monitor of trajectories, or older
             return False
         origin, done, self.newest, version, *window = arrays["stream"].tolist()
@@ -305,7 +306,7 @@ class StreamMachine(Machine[Monitor]):
             assert self.newest is not None
             pause = (moment - self.newest) / SECOND
             text = f"no sample for {pause:.6g} s: the monitor begins anew"
-            self._log("event", moment, what="gap", text=text)
+            self.log("event", moment, what="gap", text=text)
         self._origin, self._done, self._farthest, self._begins = moment, -1, -1, True
 
     def _further(self) -> str:
@@ -319,7 +320,7 @@ class StreamMachine(Machine[Monitor]):
             text = (
                 f"samples are {behind:.6g} s behind the newest one and not used: a clock set back?"
             )
-            self._log("event", self.newest, what="clock", text=text)
+            self.log("event", self.newest, what="clock", text=text)
         return "late"
 
     def _advance(self, wait: int) -> None:
@@ -343,7 +344,7 @@ class StreamMachine(Machine[Monitor]):
                 text = f"impossible: {self._limits.text(channel, row[channel])}; it is not used"
             assert self._origin is not None
             moment = self._origin + round(place * self._period)
-            self._log("event", moment, what="impossible", text=text)
+            self.log("event", moment, what="impossible", text=text)
         return self._limits.kept(row)
 
     def _complete(self) -> None:
@@ -370,10 +371,7 @@ class StreamMachine(Machine[Monitor]):
             assert self._origin is not None
             moment = self._origin + round(place * self._period)
             how = self.rate or "the right rate again"
-            self._log("event", moment, what="rate", text=f"samples come at {how}")
-
-    def _log(self, kind: str, moment: int, **data: Any) -> None:
-        self.entries.append((kind, self.entry(moment, **data)))
+            self.log("event", moment, what="rate", text=f"samples come at {how}")
 
 
 def step(together: Sequence[tuple[StreamMachine, Work]]) -> dict[str, int]:

@@ -26,9 +26,8 @@ from retwin.monitor.server.journal import Journal
 from retwin.monitor.store.gridded import gridded
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.versions.registry import Registry
+from retwin.update.dynamics.noise import CERTAIN
 
-BAND = 1.645
-"""Half the width of the 90 % band of a Gaussian, in its standard deviations."""
 SILENT = 20
 """Sample periods without a new sample after which an asset counts as stopped, 30 s at least."""
 SILENT_SECONDS = 30.0
@@ -235,7 +234,7 @@ def _channels(monitor: AnyMonitor) -> tuple[Named, Named]:
 
 def _drawn(inputs: Named, outputs: Named, recent: Recent, part: slice) -> dict[str, Any]:
     """What plots of samples need."""
-    mean, half = recent.mean[part], BAND * recent.deviation[part]
+    mean, half = recent.mean[part], CERTAIN * recent.deviation[part]
     return {
         "inputs": inputs,
         "outputs": outputs,
