@@ -46,15 +46,6 @@ def test_an_event_needs_as_many_samples_as_show_a_shift_of_one_deviation() -> No
     assert not unseen.any()  # an event ends with a sample that is measured
 
 
-def test_an_event_needs_as_many_samples_as_it_had_until_its_last_alarm() -> None:
-    counted = np.ones((1, 12), dtype=bool)
-    for begun, needed in ((91, 5), (95, 5), (96, 6), (100, 10)):
-        ended = RULES.ends(
-            replace(course(event=90), begun=np.array([begun])), np.zeros((1, 12)), counted
-        )
-        assert int(np.argmax(ended[0])) + 1 == needed
-
-
 def test_an_event_of_the_first_sample_is_one() -> None:
     yes, no, counted = np.array([True]), np.array([False]), np.ones((1, 1), dtype=bool)
     assert RULES.ends(course(event=0, quiet=9), np.zeros((1, 1)), counted).all()

@@ -3,10 +3,8 @@
 An alarm has no end, but a fault and what it leaves behind do. The first alarm opens an event, and
 those that follow belong to it. With each alarm filter and detector begin anew, since the states of
 the machine are not what was predicted. The event ends when the detector, since it began anew, has
-no evidence against as many samples as show a shift by one standard deviation, and as there were
-from the first alarm to the last: after a long disturbance the twin may follow for a while by wrong
-states, until the machine does something else. One that lasts longer than a stated time is a change:
-the machine of now is followed from there.
+seen as many samples as show a shift by one standard deviation, and has no evidence against them.
+One that lasts longer than a stated time is a change: the machine of now is followed from there.
 """
 
 from __future__ import annotations
@@ -60,7 +58,7 @@ class Rules:
     arl : float
         Evidence from which on an alarm is raised.
     wanted : int
-        Samples with evidence that an event needs to end, at least.
+        Samples with evidence that an event needs to end.
     lasting : int
         Samples after which an event is a change.
 
@@ -82,8 +80,7 @@ class Rules:
     def ends(self, course: Course, evidence: NDArray, counted: NDArray) -> NDArray:
         """Where (n, T) an event ends, for machines that began a part with `course`."""
         quiet = course.quiet[:, None] + np.cumsum(counted, axis=1)
-        wanted = np.maximum(self.wanted, course.begun - course.event)[:, None]
-        calm = (quiet >= wanted) & (evidence * CERTAIN < quiet)
+        calm = (quiet >= self.wanted) & (evidence * CERTAIN < quiet)
         return np.asarray((course.event >= 0)[:, None] & calm & counted)
 
     def changes(self, course: Course, steps: int) -> NDArray:
