@@ -214,8 +214,7 @@ def _replay_trajectories(
     from retwin.monitor import TrajectoryMonitor
     from retwin.monitor.live.sentences import REMEDY
 
-    made, state = TrajectoryMonitor.load(monitor), None
-    system = case_named(case or getattr(made.twin, "case", None) or None)
+    made, system, state = TrajectoryMonitor.load(monitor), case_named(case), None
     rows, found, texts = [], [], []
     for file in logs:
         record = reading(file, system)

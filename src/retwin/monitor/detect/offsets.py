@@ -122,9 +122,12 @@ class OffsetModel:
             return None
         parts = [arrays[f"offset_{name}"] for name in ("mean", "deviation", "kappa", "degrees")]
         mean, deviation, kappa, degrees = parts
-        shapes = mean.shape == deviation.shape == kappa.shape == (actuators,)
-        right = shapes and degrees.shape == (3,) and all(np.isfinite(each).all() for each in parts)
-        right = right and (deviation >= 0).all() and (kappa >= 1).all() and (degrees > 2).all()
+        right = (
+            mean.shape == deviation.shape == kappa.shape == (actuators,)
+            and degrees.shape == (3,)
+            and all(np.isfinite(each).all() for each in parts)
+            and all([(deviation >= 0).all(), (kappa >= 1).all(), (degrees > 2).all()])
+        )
         check_weights(right, f"the offsets of {actuators} actuators")
         return cls(mean, deviation, kappa, degrees)
 

@@ -67,9 +67,12 @@ def read_fields(folder: str | Path) -> dict[str, Any]:
         parts = disturbance.mean, scores.independent, slack, *of_noise, arrays["resolution"]
         shapes = [len(each) for each in parts]
         values = (disturbance.coefficients, noise.mean, noise.scale, noise.low, noise.high)
-        right = shapes == [streams] * 6 + [len(twin.outputs)]
-        right = right and all(np.isfinite(each).all() for each in values)
-        right = right and (disturbance.process > 0).all() and (disturbance.measurement >= 0).all()
+        right = (
+            shapes == [streams] * 6 + [len(twin.outputs)]
+            and all(np.isfinite(each).all() for each in values)
+            and (disturbance.process > 0).all()
+            and (disturbance.measurement >= 0).all()
+        )
         check_weights(right, f"the calibration of {len(twin.outputs)} outputs", shapes)
         return {
             "twin": twin,

@@ -182,19 +182,13 @@ class Views:
             "ok": True,
         }
         return {
-            "asset": status.asset,
-            "twin": status.twin,
-            "version": status.version,
+            **{name: getattr(status, name) for name in SHARED},
             "time": None if status.time is None else status.time / SECOND,
             "evidence": status.ratio,
-            "event": status.event,
             "void_since": self.journal.void(status.asset) if status.void else None,
             "alarm": None if alarm is None else self._explained(alarm, twins),
             "state": next(name for name, holds in states.items() if holds),
-            "rate": status.rate,
-            "impossible": status.impossible,
             "idle": idle,
-            "counts": status.counts,
         }
 
     def _explained(self, alarm: Mapping[str, Any], twins: Mapping[str, str]) -> dict[str, Any]:
@@ -247,6 +241,8 @@ def _drawn(inputs: Named, outputs: Named, recent: Recent, part: slice) -> dict[s
     }
 
 
+SHARED = ("asset", "twin", "version", "event", "rate", "impossible", "counts")
+"""What the page shows of a status as it is."""
 ORDER = ("alarm", "void", "impossible", "stopped", "rate", "outside", "ok")
 """The states of assets, the worst first."""
 

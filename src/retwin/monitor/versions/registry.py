@@ -271,8 +271,8 @@ class Registry:
         """The hash of a folder, after it was copied under that name unless it was before."""
         refused = "a folder of files that can be read"
         with refusing(source, expected=refused, remedy="save the model again"):
-            folder = source.is_dir() and not source.is_symlink()
-            files = list(_files(source)) if folder else []
+            there = source.is_dir() and not source.is_symlink()
+            files = list(_files(source)) if there else []
             wanted, got = "the folder of a saved model", f"{source}, which is empty or none"
             require(files, "folder", expected=wanted, got=got, remedy="save the model first")
             Budget("folder", disk=self._store.folder).take(sum(f.stat().st_size for f in files))
