@@ -172,6 +172,7 @@ def over_http(monitor: Monitor, begin: int) -> dict[str, float]:
                     live.submit([Samples(f"m{i}", times, changed)])
                 explained = threading.Thread(target=explanations.wait)
                 explained.start()
+                connection.close()  # the server does, after a pause; the next request opens it
             while len(own) <= SENT if what == "alone" else explained.is_alive():
                 pump, level = values[k]
                 sample = {"asset": "m0", "time_ns": begin + k * SECOND // 10}

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import retwin as rt
-from retwin.cli.monitor import _alarm_causes, _written
+from retwin.cli.monitor import _written
 from retwin.monitor import Alarm
 from retwin.monitor.models.cause import Cause
-from retwin.twins import ParameterShift, SensorBias
+from retwin.twins import ParameterShift
 from retwin.update import DynamicsTwin
 
 
@@ -101,6 +101,29 @@ def test_tables_calibrate_without_a_model(call, tmp_path: Path) -> None:
     assert (event["output"], 150 <= event["time"] < 160) == ("pressure", True)
 
 
+def test_a_black_box_keeps_the_case_that_its_records_are_read_by(
+    watched: Path, call, tmp_path: Path
+) -> None:
+    columns = "\n".join(
+        f'{part} = {{ valve = "u{i}", level = "y{i}" }}'
+        for i, part in enumerate(("calibration", "test"), 1)
+    )
+    case = watched / "recorded.toml"
+    case.write_text(f"{(watched / 'case.toml').read_text()}[records]\n{columns}\n")
+    rng, steps = np.random.default_rng(0), 300
+    valve = np.repeat(rng.random((steps // 10, 2)), 10, axis=0)
+    level = lfilter([0.1], [1, -0.9], valve, axis=0) + 0.01 * rng.normal(size=(steps, 2))
+    rows = np.c_[valve[:, 0], level[:, 0], valve[:, 1], level[:, 1]]
+    file, out = tmp_path / "day.csv", tmp_path / "watch"
+    np.savetxt(file, rows, delimiter=",", header="u1,y1,u2,y2", comments="")
+    code, printed, err = call("monitor", "fit", file, "--case", case, "--out", out)
+    assert code == 0, err
+    assert "causes are channels" in " ".join(printed.split())
+    code, printed, err = call("monitor", "replay", out, file, "--json")
+    assert code == 0, err
+    assert json.loads(printed)["records"][0]["measured_samples"] == 2 * steps
+
+
 def test_what_cannot_calibrate_leaves_nothing(watched: Path, call, tmp_path) -> None:
     faulty = rt.load(watched / "healthy.npz").replace(labels=np.array(["leaking"]))
     rt.save(faulty, tmp_path / "faulty.npz")
@@ -145,12 +168,3 @@ def test_trajectories_are_watched_by_a_diagnoser(watched: Path, call, tmp_path: 
     assert (leaking["alarms"][0]["number"], leaking["alarms"][0]["name"]) == (13, "leaking")
     code, printed, _ = call(*replayed, tmp_path / "leak.npz")
     assert "healthy.npz: 0 alarms in 13 trajectories." in printed
-
-
-def test_causes_of_a_case_are_not_those_of_a_black_box() -> None:
-    causes = {"leak": ParameterShift("drain", size=0.5), "offset": SensorBias(0, size=0.1)}
-    for parameter, expected in (("drain", causes), ("level[k-1]", None)):
-        own = SimpleNamespace(parameters=(SimpleNamespace(name=parameter),))
-        system, twin = SimpleNamespace(alarm_causes=causes), SimpleNamespace(equations=own)
-        assert _alarm_causes(system, twin) == expected  # type: ignore[arg-type]
-    assert _alarm_causes(None, twin) is None  # type: ignore[arg-type]

@@ -35,6 +35,7 @@ from retwin.monitor.live.stream_machine import PLACES, StreamMachine
 from retwin.monitor.program import _offer
 from retwin.monitor.settings import TwinSettings
 from retwin.monitor.store.audit import Entry
+from retwin.monitor.store.gridded import gridded
 from retwin.monitor.store.updates import Asset, Update
 from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics
@@ -233,6 +234,44 @@ def test_another_sample_rate_is_a_status_and_an_event(store: Store) -> None:
     tenth = BEGIN + 380 * SECOND + np.arange(1200) * SECOND // 10
     live.submit([Samples("a", tenth, np.repeat(made[:120], 10, axis=0))])
     assert live.status()[0].rate.startswith("10 Hz")
+
+
+def test_an_impossible_value_is_named_and_not_used(store: Store, monitor: Monitor) -> None:
+    made = rows(recorded(2))
+    made[100:103, 1] = -40.0
+    limits = {"limits": {"level": [-1.0, 5.0]}}
+    live = Live(store)
+    live.add("a", "tank", limits)
+    live.submit([samples(made[:101])])
+    assert live.status()[0].impossible == (
+        "level is outside its limits -1 to 5 m: the sensor or its line is at fault"
+    )
+    live = Live(store)  # it is not logged again after a restart
+    assert live.status()[0].impossible
+    live.submit([samples(made[101:150], 101)])
+    expected = made.copy()
+    expected[100:103, 1] = np.nan
+    commands, measured = np.split(expected[None, :150], [1], axis=2)
+    assert alarms(store) == []
+    assert live.status()[0].ratio == (
+        monitor.step(monitor.start(1), commands, measured)[1].evidence[0, -1] / monitor.arl
+    )
+    _, found = gridded(store, "a", monitor.twin, BEGIN, BEGIN + 150 * SECOND)
+    np.testing.assert_array_equal(found, expected[:150])
+    live.submit([samples(made[150:204], 150)])
+    assert not live.status()[0].impossible
+    first, last = (entry.data for entry in store.log("event"))
+    assert first["text"] == (
+        "impossible: level -40 m is outside its limits -1 to 5 m: the sensor or its line is at "
+        "fault; it is not used"
+    )
+    assert (first["time"], last["time"]) == (BEGIN + 100 * SECOND, BEGIN + 202 * SECOND)
+    assert last["text"] == "level is within its limits again"
+    with pytest.raises(InputError, match="limits"):
+        live.add("b", "tank", {"limits": {"air": [0.0, 1.0]}})
+    live.add("c", "tank", {"limits": {"pump": [0.0, 10.0]}})
+    impossible = np.array([[99.0, 0.5]])
+    assert live.submit([samples(impossible, asset="c")])[0].counts.unknown == 1
 
 
 def test_a_new_version_begins_anew(store: Store, monitor: Monitor, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 
 import retwin as rt
 from retwin.monitor import Monitor, fit_monitor, possible_causes, visible_sizes
+from retwin.twins import ParameterShift, SensorBias
 
 COUNT = 3
 
@@ -61,3 +62,14 @@ def test_what_is_seen_is_saved_and_true(monitor: Monitor, tmp_path: Path) -> Non
     replace(monitor, visible=tuple(found)).save(tmp_path / "watch")
     assert Monitor.load(tmp_path / "watch").visible == tuple(found)
     assert "from" in str(offset)
+
+
+def test_causes_of_a_case_are_not_those_of_a_black_box() -> None:
+    monitor = fit_monitor(None, sensors(0, 600), "1 per day")
+    name = monitor.twin.equations.parameters[0].name
+    offset = SensorBias(0, size=(0.1, 1.0))
+    for parameter, known in (("drain", False), (name, True)):
+        causes = {"leak": ParameterShift(parameter, size=(0.5, 1.0)), "offset": offset}
+        found = possible_causes(monitor.twin, causes)
+        assert ([*found] == ["Healthy", "leak", "offset"]) == known
+        assert f"{monitor.twin.outputs.names[0]}: sensor drift" in found or known

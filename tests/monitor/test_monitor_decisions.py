@@ -170,7 +170,9 @@ class Stream:
     """A stream of a monitor that is not asked: one command, one output, at 1 Hz."""
 
     def __init__(self, **settings: Any) -> None:
-        twin = SimpleNamespace(rate=1.0, inputs=("pump",))
+        channels = {"inputs": rt.Channels(("pump",), ("V",))}
+        channels["outputs"] = rt.Channels(("level",), ("m",))
+        twin = SimpleNamespace(rate=1.0, **channels)
         layout = SimpleNamespace(start=np.zeros(1), digest=np.zeros(0))
         asset = Asset("a", 2, {}, 1)
         wait = settings.get("wait")
@@ -354,10 +356,12 @@ def test_a_promise_about_trajectories_that_becomes_void_is_logged_once(
     machine.void = before
     no = np.array([False])
     flags = dict.fromkeys(("unmeasured", "unranked", "implausible", "outside"), no)
-    watched = SimpleNamespace(alarms=[], void=np.array([now]), evidence=np.zeros(1), **flags)
+    numbers = {"evidence": np.zeros(1), "score": np.zeros(1)}
+    watched = SimpleNamespace(alarms=[], void=np.array([now]), **numbers, **flags)
     samples = Samples("a", np.arange(2), np.ones((2, 2)))
     found = Diagnosed(samples, state, watched)  # type: ignore[arg-type]
-    assert [kind for kind, _ in machine.update(found)[1]] == logged
+    assert machine.take(found) == 0
+    assert [kind for kind, _ in machine.entries] == logged
 
 
 def of_trajectories(**changes: Any) -> TrajectoryMonitor:
@@ -696,10 +700,10 @@ def test_versions_are_compared_on_long_parts_without_events_of_the_active_one(
         return SimpleNamespace(twin=twin, arl=1e4, start=lambda _: None, step=step)
 
     part = np.random.default_rng(0).normal(size=(samples, 2))
-    monkeypatch.setattr(comparison, "_healthy", lambda *_: [part])
+    monkeypatch.setattr(comparison, "_healthy_samples", lambda *_: [part])
     if compared:
-        made = comparison._compared_streams(None, "tank", version(0), version(2))  # type: ignore[arg-type]
-        assert made.false_alarms.alarms == 2
+        _, (test,) = comparison._of_samples(None, "tank", [version(0), version(2)])  # type: ignore[arg-type]
+        assert test.alarms == 2
     else:
         with pytest.raises(InputError, match="without an alarm"):
-            comparison._compared_streams(None, "tank", version(events), version(0))  # type: ignore[arg-type]
+            comparison._of_samples(None, "tank", [version(events), version(0)])  # type: ignore[arg-type]

@@ -19,7 +19,7 @@ from retwin.cli.options import (
     rare,
     seconds_of,
 )
-from retwin.cli.reading import read, shown_records
+from retwin.cli.reading import read, shown_records, stored_name
 from retwin.cli.terminal import Interrupted, answer, bar, note, table
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.places import check_place
@@ -136,8 +136,7 @@ def fit(
         calibrate_on=faults,
         prior=prior,
     )
-    # The path is absolute, since a model is also used from other folders.
-    name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
+    name = stored_name(case)
     last = not method if yardstick is None else yardstick
     found, base = _carry_out(system, measured, how, settings, name, out, seed, yardstick=last)
     _print(found, base, out, as_json=as_json)

@@ -8,7 +8,7 @@ import signal
 import tempfile
 import threading
 import webbrowser
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
@@ -31,7 +31,14 @@ from retwin.cli.options import (
     option,
     rare,
 )
-from retwin.cli.reading import case_named, read, read_signals, saved, shown_records
+from retwin.cli.reading import (
+    case_named,
+    read,
+    read_signals,
+    saved,
+    shown_records,
+    stored_name,
+)
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.quality.check import check_records
 from retwin.data.trajectories import Trajectories
@@ -42,7 +49,6 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
     from retwin.cases.twin_data import TwinData
     from retwin.monitor import Alarm, Cause, Monitor, Watched
-    from retwin.twins.faults.actuator_faults import Fault
     from retwin.update import DynamicsTwin
 
 EVENT = ("file", "record", "from s", "to s", "what", "cause")
@@ -109,8 +115,10 @@ def fit(
             known, given, false_alarms, lasting=3600.0 if lasting is None else lasting
         )
         show("faults that are seen", 0.5)
-        causes = possible_causes(made.twin, _alarm_causes(system, made.twin))
+        causes = possible_causes(made.twin, system and system.alarm_causes)
         made = replace(made, visible=tuple(visible_sizes(made, given, causes)))
+    if case:  # by which records are read later too
+        made = replace(made, twin=replace(made.twin, case=stored_name(case)))
     made.save(out)
     twin = made.twin
     hours = given.mask.any(axis=2).sum() / twin.rate / 3600
@@ -399,20 +407,10 @@ def _causes(
 
     if not alarms:
         return []
-    faults = possible_causes(monitor.twin, _alarm_causes(system, monitor.twin))
+    faults = possible_causes(monitor.twin, system and system.alarm_causes)
     with bar("explain") as show:
         show("alarms", 0.0)
         return find_causes(monitor.twin, record, alarms, faults)
-
-
-def _alarm_causes(system: Case | None, twin: DynamicsTwin) -> Mapping[str, Fault | None] | None:
-    """Those of the case; None where all its parameters are unknown to the twin: a black box."""
-    from retwin.twins.faults.system_faults import ParameterFault
-
-    causes = system.alarm_causes if system else None
-    used = {each.parameter for each in (causes or {}).values() if isinstance(each, ParameterFault)}
-    own = {each.name for each in twin.equations.parameters}
-    return None if used and not used & own else causes
 
 
 def _written(cause: Cause) -> str:

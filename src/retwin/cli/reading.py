@@ -37,6 +37,11 @@ def case_named(name: str | None) -> Case | None:
     return None if name is None else cases.get(name)
 
 
+def stored_name(name: str) -> str:
+    """The name of a case as a model keeps it: a path is absolute, to be read from other folders."""
+    return str(Path(name).resolve()) if Path(name).suffix.lower() == ".toml" else name
+
+
 def data_case(name: str | None) -> DataCase | None:
     """What the files of the case of that name need of it, if one is given."""
     from retwin import cases

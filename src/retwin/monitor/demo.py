@@ -28,7 +28,12 @@ from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 from retwin.twins.commands.samplers import HoldSampler
 from retwin.twins.faults.actuator_faults import Fault
-from retwin.twins.faults.system_faults import ActuatorGain, ParameterShift, SensorBias
+from retwin.twins.faults.system_faults import (
+    ActuatorGain,
+    ParameterShift,
+    SensorBias,
+    TimedFault,
+)
 from retwin.update import Dynamics, Library, fit_dynamics
 
 CASE = "incubator"
@@ -43,37 +48,32 @@ PARAMETERS = {
 }
 """Of the emulated machines; those of the twin differ by up to a sixth."""
 DURATION = 86_400.0
-"""Time in s by which the streams begin in the past, so that they are never ahead of the clock."""
+"""Time in s by which the streams begin in the past, so that they are never ahead of the clock; they
+last for a day more."""
 PAUSE, SHADOW = 0.1, 15.0
 """Seconds between two batches of samples, and until a second version of the twin is fitted."""
-LENGTH = 2 * DURATION
-"""Time in s that is emulated: with the clock it takes a day after the streams have caught up."""
-OPEN, OFFSET, WEAK, LASTING = 2400.0, 9000.0, 15600.0, 900.0
-"""Times in s from which the lid is open, the sensor is offset and the heater is weak, and how long
-each of them lasts."""
-MACHINES: Mapping[str, Fault | None] = {
-    "incubator 1": None,
-    "incubator 2": ParameterShift("g_box", size=5.0, onset=OPEN, end=OPEN + LASTING),
-    "incubator 3": SensorBias(0, size=1.5, onset=OFFSET, end=OFFSET + LASTING),
-    "incubator 4": ActuatorGain(0, size=-0.7, onset=WEAK, end=WEAK + LASTING),
+MACHINES: Mapping[str, tuple[str, TimedFault | None]] = {
+    "incubator 1": ("healthy", None),
+    "incubator 2": ("the lid is open", ParameterShift("g_box", size=5.0, onset=2400.0, end=3300.0)),
+    "incubator 3": ("the sensor is offset", SensorBias(0, size=1.5, onset=9000.0, end=9900.0)),
+    "incubator 4": ("the heater is weak", ActuatorGain(0, size=-0.7, onset=15600.0, end=16500.0)),
 }
-"""The machines and their faults."""
+"""The machines: what each is, and its fault with its times in s."""
 HOURS = (1.0, 6.0)
 """Hours of the healthy record to which each version of the twin is fitted."""
 
 
 def announced() -> list[str]:
     """What will be seen, and when, line by line."""
-    faults = {"lid is open": OPEN, "sensor is offset": OFFSET, "heater is weak": WEAK}
-    healthy, *faulty = MACHINES
-    return [
-        f"Emulated incubators run {SPEED:.0f} times as fast as real ones; once the page is there:",
-        f"  {healthy}: healthy",
-        *(
-            f"  {name}: the {text} from {onset / SPEED:.0f} to {(onset + LASTING) / SPEED:.0f} s"
-            for name, (text, onset) in zip(faulty, faults.items(), strict=True)
-        ),
+    made = [
+        f"Emulated incubators run {SPEED:.0f} times as fast as real ones; once the page is there:"
     ]
+    for name, (text, fault) in MACHINES.items():
+        if fault is not None:
+            begin, end = np.array([fault.onset, fault.end], dtype=float) / SPEED
+            text += f" from {begin:.0f} to {end:.0f} s"
+        made.append(f"  {name}: {text}")
+    return made
 
 
 def emulated(
@@ -150,7 +150,7 @@ def demonstration(folder: Path) -> Iterator[tuple[Live, Gate, Explanations]]:
 
 def _stream(gate: Gate, stop: threading.Event) -> None:
     """Send the samples of all machines when they are due."""
-    record = emulated(LENGTH, 1, tuple(MACHINES.values()))
+    record = emulated(2 * DURATION, 1, [fault for _, fault in MACHINES.values()])
     values = np.concatenate([record.commands, record.observed], axis=2)
     began, begin, sent = time.monotonic(), time.time() - DURATION, 0
     times = np.int64(begin * 1e9) + np.round(np.arange(record.steps) / record.rate * 1e9).astype(

@@ -88,7 +88,8 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
             _offer(Registry(store, name), twin, report)
         live = Live(store, wait=settings.wait, ahead=settings.ahead)
         for name, asset in settings.assets.items():
-            live.add(name, asset.twin)
+            limits = settings.twins[asset.twin].limits
+            live.add(name, asset.twin, {"limits": limits} if limits else None)
         news = _News(store, report)
         opened.callback(news.read)
         twins = {each.twin: live.monitor(name) for name, each in settings.assets.items()}

@@ -43,6 +43,11 @@ class TwinSettings(Part):
     """Folder of `retwin monitor fit`. It is the first version; a changed one is only proposed."""
     case: Annotated[str | None, AfterValidator(_case)] = None
     """Its case, if another than the twin was fitted for: a name, case.toml or module:object."""
+    limits: dict[Name, Annotated[list[float], Field(min_length=2, max_length=2)]] = Field(
+        default={}
+    )
+    """The smallest and the largest possible value of channels, such as { air = [-40, 150] }: a
+    value outside of them is reported as impossible and not used."""
 
 
 class AssetSettings(Part):

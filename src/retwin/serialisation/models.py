@@ -135,6 +135,11 @@ def _limit_memory(where: str) -> Iterator[None]:
         yield
 
 
+def check_weights(right: object, expected: str, got: object = "others") -> None:
+    """Require the arrays of a saved model to be of the shapes and values that it needs."""
+    require(right, "weights", expected=expected, got=got, remedy=REMEDY)
+
+
 def read_about(folder: str | Path, kind: str) -> dict[str, Any]:
     """The description of a model folder without its weights; raises as `read_model` does."""
     return read_model(folder, kind)[0]

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from retwin.checks import require
+from retwin.serialisation.models import check_weights
 from retwin.twins.faults.actuator_faults import ActuatorBias, Fault
+from retwin.update.dynamics.noise import CERTAIN
 
 SIZES = (1 / 6, 1 / 2, 5 / 6)
 """Sizes of a bias that are tried, as shares of the way from its smallest to its largest size on a
@@ -36,8 +37,6 @@ DEGREES = (2.5, 100.0)
 above 100 it is a normal one."""
 TRIED = 60
 """Degrees of freedom that are tried between these."""
-CERTAIN = 1.645
-"""Standard errors by which the standard deviation is increased: 95 %, one-sided."""
 WORSE = CERTAIN**2 / 2
 """Nats by which degrees of freedom may be less likely than the best: 95 % in each direction."""
 
@@ -123,18 +122,13 @@ class OffsetModel:
             return None
         parts = [arrays[f"offset_{name}"] for name in ("mean", "deviation", "kappa", "degrees")]
         mean, deviation, kappa, degrees = parts
-        require(
+        right = (
             mean.shape == deviation.shape == kappa.shape == (actuators,)
-            and all(np.isfinite(each).all() for each in parts)
-            and (deviation >= 0).all()
-            and (kappa >= 1).all()
             and degrees.shape == (3,)
-            and (degrees > 2).all(),
-            "weights",
-            expected=f"the offsets of {actuators} actuators",
-            got="others",
-            remedy="save the monitor again",
+            and all(np.isfinite(each).all() for each in parts)
+            and all([(deviation >= 0).all(), (kappa >= 1).all(), (degrees > 2).all()])
         )
+        check_weights(right, f"the offsets of {actuators} actuators")
         return cls(mean, deviation, kappa, degrees)
 
 

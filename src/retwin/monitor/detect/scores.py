@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, ndtri
 
 from retwin.checks import require, whole
+from retwin.monitor.detect.bets import CLIP
 from retwin.monitor.detect.slack import Slack, effective_samples
+from retwin.serialisation.models import check_weights
 
 MIN_ERRORS = 8
 """Calibration errors per stream, at least."""
@@ -22,8 +24,6 @@ NEAR = 10.0
 """Steps up to which a difference is counted with a step that is not exact yet."""
 INEXACT = 0.05
 """Share of a step by which a value may be no multiple of it."""
-FARTHEST = 4.0
-"""Scores beyond it count as it in a detector."""
 SCALES = np.geomspace(0.05, 2, 32)
 """Standard deviations of errors before rounding, relative to those after it."""
 
@@ -109,13 +109,7 @@ class ConformalScores:
         errors.real, errors.imag = arrays["stream"], arrays["error"]
         quantiles, independent = arrays["quantiles"], arrays["independent"]
         ranks = len(errors) + len(independent) * (whole("copies", copies, least=1) + 1)
-        require(
-            len(quantiles) == ranks,
-            "quantiles",
-            expected=f"{ranks}, one per rank",
-            got=len(quantiles),
-            remedy="save the calibration again",
-        )
+        check_weights(len(quantiles) == ranks, f"{ranks} quantiles, one per rank", len(quantiles))
         return cls(errors, quantiles, copies, independent)
 
     def slack(self, parameters: ArrayLike = 0, confidence: float = 0.95) -> tuple[Slack, ...]:
@@ -168,13 +162,12 @@ def fit_scores(errors: ArrayLike, width: ArrayLike = 0.0) -> ConformalScores:
     ranks = [len(row) + copies for row in rows]
     quantiles = np.concatenate([ndtri(np.arange(count + 1) / count) for count in ranks])
     fitted = ConformalScores(keys, quantiles, copies, seen.sum(axis=1).astype(float))
-    low, high = (np.clip(each, -4, 4) for each in fitted.score(given, widths))
-    return replace(fitted, independent=effective_samples((low + high) / 2))
+    return replace(fitted, independent=effective_samples(middle(*fitted.score(given, widths))))
 
 
 def middle(low: NDArray, high: NDArray) -> NDArray:
     """Middles of intervals of scores, each end from -4 to 4: larger ones are not distinguished."""
-    return (np.clip(low, -FARTHEST, FARTHEST) + np.clip(high, -FARTHEST, FARTHEST)) / 2
+    return (np.clip(low, -CLIP, CLIP) + np.clip(high, -CLIP, CLIP)) / 2
 
 
 def resolution(measured: ArrayLike) -> NDArray:

@@ -18,13 +18,15 @@ from retwin.monitor.live.layout import Layout
 from retwin.monitor.live.machine import Counts, Recent
 from retwin.monitor.live.status import AssetStatus, Received
 from retwin.monitor.live.stream_machine import StreamMachine, Work, step
-from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
+from retwin.monitor.live.trajectory_machine import TrajectoryMachine
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
+from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.trajectories import TrajectoryMonitor
 from retwin.monitor.store.audit import Entry
+from retwin.monitor.store.limits import Limits
 from retwin.monitor.store.samples import SECOND, Samples, Trajectory
 from retwin.monitor.store.store import Store
-from retwin.monitor.store.updates import LATEST, Asset, Update, one_asset
+from retwin.monitor.store.updates import LATEST, Asset, one_asset
 from retwin.monitor.versions.registry import Registry
 
 MAX_WAIT = 60.0
@@ -92,16 +94,29 @@ class Live:
     def add(self, name: str, twin: str, settings: Mapping[str, Any] | None = None) -> None:
         """Watch a machine by the active version of a twin; one that is watched so stays as it is.
 
+        Parameters
+        ----------
+        name, twin : str
+            Names of the machine and of its twin.
+        settings : mapping, optional
+            JSON values that are kept; of these, `limits` are the smallest and the largest possible
+            value of channels, by their names. Another value is logged, and not used.
+
         Raises
         ------
         InputError
-            The twin has no active version, or the machine has other channels.
+            The twin has no active version, the machine has other channels, or limits are those of
+            another channel, or of a machine that is watched trajectory by trajectory.
 
         """
         with self._lock:
             version = self._active(twin)
             monitor, _ = self._monitor(twin, version)
             channels = len(monitor.twin.inputs) + len(monitor.twin.outputs)
+            if limits := (settings or {}).get("limits", {}):
+                Limits.of(monitor.twin, limits)
+                remedy = "leave out its limits: implausible trajectories are found without them"
+                instance("limits", monitor, Monitor, remedy=remedy)
             asset = Asset(name, channels, {**(settings or {}), "twin": twin}, version)
             known = {each.name: each for each in self.store.assets()}.get(name)
             if asset != known:
@@ -252,36 +267,38 @@ class Live:
                 assert isinstance(given, Trajectory)
                 made = machine.diagnose(given)
                 with self._lock, self._rereading(given.asset):
-                    # Another version may watch since.
-                    if self._machines.get(given.asset) is machine:
-                        return self._stored(machine, made)
+                    if self._machines.get(given.asset) is not machine:
+                        continue  # another version watches since
+                    if made.watched is None:
+                        machine.refuse(int(made.samples.times[0]), made.refused)
+                        return self._counted(machine, "refused")
+                    return self._counted(machine, "used", machine.take(made))
 
     def _unused(self, machine: TrajectoryMachine, given: Samples | Trajectory) -> Received | None:
         """What became of a trajectory that is not to be diagnosed; None for one that is."""
         begin = given.begin if isinstance(given, Trajectory) else None
         known = () if begin is None else self.store.present(given.asset, np.array([begin]))
         what = machine.placed(given, self._limit(), set(np.array(known).tolist()))
-        if what == "used":
-            return None
         if what in WHY:
-            self.log([machine.refusal(begin or self._clock(), WHY[what])])
-        return self._counted(machine, what, 0)
+            machine.refuse(begin or self._clock(), WHY[what])
+        return None if what == "used" else self._counted(machine, what)
 
-    def _stored(self, machine: TrajectoryMachine, made: Diagnosed) -> Received:
-        if made.watched is None:
-            self.log([machine.refusal(int(made.samples.times[0]), made.refused)])
-            return self._counted(machine, "refused", 0)
-        update, entries = machine.update(made)
-        committed = self.store.commit([update], entries).entries
-        machine.take(made)
-        received = self._counted(machine, "used", len(made.watched.alarms))
-        self._announce(committed)
-        return received
-
-    def _counted(self, machine: TrajectoryMachine, what: str, alarms: int) -> Received:
+    def _counted(self, machine: TrajectoryMachine, what: str, alarms: int = 0) -> Received:
+        """Store what a trajectory changes, and count it."""
+        self._commit([machine])
         counts = Counts(**{what: 1})
         machine.counts.add(counts)
         return Received(machine.asset.name, counts, alarms)
+
+    def _commit(self, machines: Sequence[StreamMachine | TrajectoryMachine]) -> None:
+        """Store what is new of machines, all or none."""
+        updates = [update for each in machines if (update := each.update())]
+        entries = [entry for each in machines for entry in each.entries]
+        entries.sort(key=lambda each: (each[1]["time"], each[1]["asset"]))
+        committed = self.store.commit(updates, entries).entries if updates or entries else []
+        for each in machines:
+            each.committed()
+        self._announce(committed)
 
     def _limit(self) -> int:
         return self._clock() + round(self._ahead * SECOND)
@@ -322,18 +339,7 @@ class Live:
             found.append(counts)
         machines = list(dict.fromkeys(streams))
         alarms += self._stepped(machines)
-        updates, entries = [], []
-        for machine in machines:
-            new = machine.new_samples()
-            state = machine.arrays() if machine.changed else None
-            if state is not None or len(new.times):
-                updates.append(Update(new.asset, new.times, new.values, state, machine.newest or 0))
-            entries += machine.entries
-        entries.sort(key=lambda each: (each[1]["time"], each[1]["asset"]))
-        committed = self.store.commit(updates, entries).entries if updates or entries else []
-        for machine in machines:
-            machine.committed()
-        self._announce(committed)
+        self._commit(machines)
         last = {each.asset: i for i, each in enumerate(batch)}
         return [
             Received(each.asset, counts, alarms[each.asset] * (last[each.asset] == i))

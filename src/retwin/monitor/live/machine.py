@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 
 from numpy.typing import NDArray
 
-from retwin.monitor.store.updates import Asset
+from retwin.monitor.store.updates import Asset, Update
 
 KEPT = 600
 """Newest samples or trajectories that are kept for pages."""
@@ -89,6 +89,8 @@ class Machine(ABC, Generic[Watching]):
 
     Attributes
     ----------
+    entries : list of (str, dict)
+        New entries of the log, which are stored with the next commit.
     counts : Counts
         Samples or trajectories since the program was started, by what was done with them.
     newest : int or None
@@ -108,6 +110,7 @@ class Machine(ABC, Generic[Watching]):
     def __init__(self, asset: Asset, monitor: Watching) -> None:
         self.asset = asset
         self.monitor = monitor
+        self.entries: list[tuple[str, dict[str, Any]]] = []
         self.counts = Counts()
         self.newest: int | None = None
         self.evidence = 0.0
@@ -120,15 +123,24 @@ class Machine(ABC, Generic[Watching]):
         """How the sample rate differs from the twin's; "" if it does not."""
         return ""
 
+    @property
+    def impossible(self) -> str:
+        """Which channels have had impossible values; "" for none."""
+        return ""
+
     @abstractmethod
     def recent(self) -> Recent:
         """The newest samples, or scores of the newest trajectories."""
 
-    def entry(self, moment: int, **data: Any) -> dict[str, Any]:
-        """The data of an entry of the log about this machine at a time in nanoseconds."""
-        return {
-            "asset": self.asset.name,
-            "version": self.asset.version,
-            "time": moment,
-            **data,
-        }
+    @abstractmethod
+    def update(self) -> Update | None:
+        """What is not stored yet, beside the entries; None for nothing."""
+
+    def committed(self) -> None:
+        """Everything is stored."""
+        self.entries = []
+
+    def log(self, kind: str, moment: int, **data: Any) -> None:
+        """Add an entry about this machine at a time in nanoseconds."""
+        about = {"asset": self.asset.name, "version": self.asset.version, "time": moment}
+        self.entries.append((kind, {**about, **data}))

@@ -53,6 +53,8 @@ class AssetStatus:
         How the sample rate differs from the twin's; "" if it does not.
     counts : dict of str to int
         Samples since the program was started, by what was done with them.
+    impossible : str
+        Which channels have had impossible values; "" for none.
 
     """
 
@@ -68,21 +70,18 @@ class AssetStatus:
     outside: bool
     rate: str
     counts: dict[str, int]
+    impossible: str = ""
 
     @classmethod
     def of(cls, machine: Machine[Any], arl: float) -> AssetStatus:
         """The status of a machine whose alarms have that threshold."""
+        same = ("alarms", "last_alarm", "event", "void", "outside", "rate", "impossible")
         return cls(
-            machine.asset.name,
-            machine.asset.settings["twin"],
-            machine.asset.version or 0,
-            machine.newest,
-            machine.evidence / arl,
-            machine.alarms,
-            machine.last_alarm,
-            machine.event,
-            machine.void,
-            machine.outside,
-            machine.rate,
-            vars(machine.counts).copy(),
+            asset=machine.asset.name,
+            twin=machine.asset.settings["twin"],
+            version=machine.asset.version or 0,
+            time=machine.newest,
+            ratio=machine.evidence / arl,
+            counts=vars(machine.counts).copy(),
+            **{name: getattr(machine, name) for name in same},
         )

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,9 @@ from retwin.monitor.live.layout import Layout
 from retwin.monitor.live.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.watched import Alarm, Ending, Watched
+from retwin.monitor.store.limits import Limits
 from retwin.monitor.store.samples import SECOND, Samples
-from retwin.monitor.store.updates import EARLIEST, Asset
+from retwin.monitor.store.updates import EARLIEST, Asset, Update
 
 ALARM = ("sample", "output", "change", "evidence", "machine")
 """What the log has of an alarm, beside its time and that of its event."""
@@ -34,7 +34,9 @@ PLACES = 4 * PART
 """Places, most of them perhaps without a sample, from which on they are stepped before others are
 taken: that bounds the memory for any times of the samples."""
 WINDOW, TOLERATED = 100, 20
-"""Places of a check of the sample rate, and how many may be missing or have further samples."""
+"""Places of a check of the sample rate, and how many may be missing or have further samples; as
+many places without an impossible value of a channel are needed until it counts as possible again.
+"""
 BEHIND = 10
 """Late samples in a row from which on the clock of the machine counts as set back."""
 
@@ -69,7 +71,6 @@ class StreamMachine(Machine[Monitor]):
         super().__init__(asset, monitor)
         rate = monitor.twin.rate
         self.layout = layout
-        self.entries: list[tuple[str, dict[str, Any]]] = []
         self.changed = False
         self._period = SECOND / rate
         self._wait = DEFAULT_WAIT if wait is None else int(np.ceil(wait * rate))
@@ -89,6 +90,9 @@ class StreamMachine(Machine[Monitor]):
         self._wrong = [0, 0, 0]
         """The newest full window if its rate was another one than the twin's."""
         self._late = 0
+        self._limits = Limits.of(monitor.twin, asset.settings.get("limits", {}))
+        self._doubtful = np.zeros(asset.channels)
+        """Places until each channel counts as possible again; 0 for one that is."""
         self._recent: deque[tuple[NDArray, ...]] = deque()
         self._kept = 0
 
@@ -100,6 +104,11 @@ class StreamMachine(Machine[Monitor]):
             return ""
         rate = self.monitor.twin.rate
         return f"{rate * (places - absent + further) / places:.4g} Hz instead of {rate:.4g} Hz"
+
+    @property
+    def impossible(self) -> str:
+        """Which channels have had impossible values; "" for none."""
+        return "; ".join(map(self._limits.text, np.flatnonzero(self._doubtful).tolist()))
 
     @property
     def stepped_time(self) -> int:
@@ -185,13 +194,13 @@ class StreamMachine(Machine[Monitor]):
                 self.last_alarm = moment
             data = {name: getattr(alarm, name) for name in ALARM}
             event = self._moment(work, alarm.event)
-            self._log("alarm" if alarm.promised else "remark", moment, **data, event=event)
+            self.log("alarm" if alarm.promised else "remark", moment, **data, event=event)
         for ending in endings:
             moment, event = (self._moment(work, each) for each in (ending.sample, ending.event))
-            self._log("end", moment, event=event, how=ending.how)
+            self.log("end", moment, event=event, how=ending.how)
         void = found["void"]
         if void.any() and not self.void:
-            self._log("void", int(times[int(np.argmax(void))]))
+            self.log("void", int(times[int(np.argmax(void))]))
         self.void = bool(void[-1])
         commands, measured = np.split(work.values, [self._commands], axis=1)
         predicted = (found["mean"], found["deviation"], found["evidence"])
@@ -210,28 +219,31 @@ class StreamMachine(Machine[Monitor]):
         commands, measured, mean, deviation, evidence = more
         return Recent(times, commands, measured, mean, deviation, evidence)
 
-    def new_samples(self) -> Samples:
-        """Samples that are not stored yet."""
+    def update(self) -> Update | None:
+        """Samples that are not stored yet, and the state after those that were stepped."""
+        if not self._new and not self.changed:
+            return None
         times = np.array(list(self._new), dtype=np.int64)
         rows = np.array(list(self._new.values())).reshape(-1, self.asset.channels)
-        return Samples(self.asset.name, times, rows)
+        state = self._arrays() if self.changed else None
+        return Update(self.asset.name, times, rows, state, self.newest or 0)
 
     def committed(self) -> None:
         """Everything is stored."""
-        self._new, self.entries, self.changed = {}, [], False
+        super().committed()
+        self._new, self.changed = {}, False
 
-    def arrays(self) -> dict[str, NDArray]:
-        """All that must be stored, beside the samples."""
+    def _arrays(self) -> dict[str, NDArray]:
         own = (self._origin, self._done, self.newest, self.asset.version, *self._window)
         return {
             "stream": np.array(own, dtype=np.int64),
             "monitor": self._state,
-            "status": np.array([self.evidence, *self._wrong], dtype=float),
+            "status": np.array([self.evidence, *self._wrong, *self._doubtful], dtype=float),
             "digest": self.layout.digest,
         }
 
     def restore(self, arrays: Mapping[str, NDArray]) -> bool:
-        """Continue where `arrays` was stored; False if another version or monitor watched."""
+        """Continue where a state was stored; False if another version or monitor watched."""
         if not {"stream", "status"} <= arrays.keys():  # of a monitor of trajectories, or older
             return False
         origin, done, self.newest, version, *window = arrays["stream"].tolist()
@@ -243,8 +255,9 @@ class StreamMachine(Machine[Monitor]):
         self._state, self._begins = arrays["monitor"], False
         before = self.layout.state(self._state[None])
         self.void, self.event = bool(before.void[0]), bool(before.course.event[0] >= 0)
-        self.evidence, *wrong = arrays["status"].tolist()
-        self._wrong = [int(each) for each in wrong]
+        self.evidence, *more = arrays["status"].tolist()
+        self._wrong = [int(each) for each in more[:3]]
+        self._doubtful = np.array(more[3:] or self._doubtful)  # states of before have no limits
         return True
 
     def _moment(self, work: Work, place: int) -> int:
@@ -273,7 +286,7 @@ class StreamMachine(Machine[Monitor]):
                 return self._further() if later else self._too_late(moment)
             begins = place - self._farthest > self._gap
         if begins:
-            if not np.isfinite(row[: self._commands]).all():
+            if not np.isfinite(self._limits.kept(row)[: self._commands]).all():
                 return "unknown"
             self._begin(moment)
         place = self._place(moment)
@@ -293,7 +306,7 @@ class StreamMachine(Machine[Monitor]):
             assert self.newest is not None
             pause = (moment - self.newest) / SECOND
             text = f"no sample for {pause:.6g} s: the monitor begins anew"
-            self._log("event", moment, what="gap", text=text)
+            self.log("event", moment, what="gap", text=text)
         self._origin, self._done, self._farthest, self._begins = moment, -1, -1, True
 
     def _further(self) -> str:
@@ -307,7 +320,7 @@ class StreamMachine(Machine[Monitor]):
             text = (
                 f"samples are {behind:.6g} s behind the newest one and not used: a clock set back?"
             )
-            self._log("event", self.newest, what="clock", text=text)
+            self.log("event", self.newest, what="clock", text=text)
         return "late"
 
     def _advance(self, wait: int) -> None:
@@ -317,9 +330,22 @@ class StreamMachine(Machine[Monitor]):
             found = self._pending.pop(place, None)
             if found is None and self._farthest - place < wait:
                 return
-            self._rows.append(self._missing if found is None else found[1])
+            self._rows.append(self._measured(place, self._missing if found is None else found[1]))
             self._done = place
             self._checked_rate(place, missing=found is None)
+
+    def _measured(self, place: int, row: NDArray) -> NDArray:
+        """The values of a place that are possible; when others begin and end is logged."""
+        outside, before = self._limits.outside(row), self._doubtful
+        self._doubtful = np.where(outside, WINDOW, np.maximum(before - 1, 0))
+        for channel in np.flatnonzero((before > 0) != (self._doubtful > 0)).tolist():
+            text = f"{self._limits.names[channel]} is within its limits again"
+            if outside[channel]:
+                text = f"impossible: {self._limits.text(channel, row[channel])}; it is not used"
+            assert self._origin is not None
+            moment = self._origin + round(place * self._period)
+            self.log("event", moment, what="impossible", text=text)
+        return self._limits.kept(row)
 
     def _complete(self) -> None:
         """Make work of the places that were passed."""
@@ -345,10 +371,7 @@ class StreamMachine(Machine[Monitor]):
             assert self._origin is not None
             moment = self._origin + round(place * self._period)
             how = self.rate or "the right rate again"
-            self._log("event", moment, what="rate", text=f"samples come at {how}")
-
-    def _log(self, kind: str, moment: int, **data: Any) -> None:
-        self.entries.append((kind, self.entry(moment, **data)))
+            self.log("event", moment, what="rate", text=f"samples come at {how}")
 
 
 def step(together: Sequence[tuple[StreamMachine, Work]]) -> dict[str, int]:

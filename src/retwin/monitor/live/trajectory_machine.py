@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +64,7 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         """Begin, end and number of samples of the newest trajectories."""
         self._remark = 0
         """Why the newest trajectory was not used as usual, as a place in UNUSUAL from 1; or 0."""
+        self._new: Samples | None = None
         self._recent: deque[tuple[int, float, float]] = deque(maxlen=KEPT)
 
     def placed(self, given: object, limit: int, known: set[int]) -> str:
@@ -91,6 +91,10 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         first = given.values[:1, : len(self.monitor.twin.inputs)]
         return "used" if np.isfinite(first).all() and len(first) else "unknown"
 
+    def refuse(self, moment: int, why: str) -> None:
+        """Log why a trajectory is not used."""
+        self.log("event", moment, what="trajectory", text=f"trajectory not used: {why}")
+
     def diagnose(self, given: Trajectory) -> Diagnosed:
         """What a trajectory changes; nothing is changed yet, so that no lock is needed."""
         samples = given.samples(self.monitor.twin.rate)
@@ -101,44 +105,50 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
             why = str(error) if isinstance(error, InputError) else f"not diagnosed: {brief(error)}"
             return Diagnosed(samples, self._state, None, why)
 
-    def update(self, found: Diagnosed) -> tuple[Update, list[tuple[str, dict[str, Any]]]]:
-        """What a diagnosed trajectory stores: its samples with the state, and log entries."""
+    def take(self, found: Diagnosed) -> int:
+        """Continue after a diagnosed trajectory; the number of its alarms."""
         watched, samples = found.watched, found.samples
         assert watched is not None
         last = int(samples.times[-1])
-        entries = [
-            ("alarm", self._alarm(found, watched, number)) for number in range(len(watched.alarms))
-        ]
+        for number in range(len(watched.alarms)):
+            self._alarm(found, watched, number)
         if watched.void[-1] and not self.void:
-            entries.append(("void", self.entry(last)))
-        remark = self._remarked(watched)
+            self.log("void", last)
+        remark = next((i for i, name in enumerate(UNUSUAL, 1) if getattr(watched, name)[-1]), 0)
         if remark != self._remark:
             again = "measured as those of the calibration again"
             text = f"trajectory {REMARKS[UNUSUAL[remark - 1]] if remark else again}"
-            entries.append(("event", self.entry(last, what="trajectory", text=text)))
-        status = watched.evidence[-1], watched.void[-1], watched.outside[-1], remark
-        arrays = {
-            **{f"trajectory.{name}": each for name, each in found.state.arrays().items()},
-            "version": np.array([self.asset.version], dtype=np.int64),
-            "status": np.array(status, dtype=float),
-            "digest": self._digest,
-            "trajectories": self._with(samples),
-        }
-        return Update(samples.asset, samples.times, samples.values, arrays, last), entries
-
-    def take(self, found: Diagnosed) -> None:
-        """Continue after a trajectory that is stored."""
-        watched, last = found.watched, int(found.samples.times[-1])
-        assert watched is not None
-        self._state, self.newest = found.state, last
-        self._known = self._with(found.samples)
+            self.log("event", last, what="trajectory", text=text)
+        self._remark, self._state, self.newest = remark, found.state, last
         self.evidence = float(watched.evidence[-1])
         self.void, self.outside = bool(watched.void[-1]), bool(watched.outside[-1])
-        self._remark = self._remarked(watched)
+        new = np.array([[*samples.times[[0, -1]], len(samples.times)]], dtype=np.int64)
+        self._known = np.concatenate([self._known, new])[-REMEMBERED:]
         self._recent.append((last, float(watched.score[-1]), self.evidence))
         if watched.alarms:
             self.alarms += len(watched.alarms)
             self.last_alarm = last
+        self._new = samples
+        return len(watched.alarms)
+
+    def update(self) -> Update | None:
+        """The samples of the trajectory that is not stored yet, with the state after it."""
+        if self._new is None:
+            return None
+        status = self.evidence, self.void, self.outside, self._remark
+        arrays = {
+            **{f"trajectory.{name}": each for name, each in self._state.arrays().items()},
+            "version": np.array([self.asset.version], dtype=np.int64),
+            "status": np.array(status, dtype=float),
+            "digest": self._digest,
+            "trajectories": self._known,
+        }
+        return Update(self._new.asset, self._new.times, self._new.values, arrays, self.newest)
+
+    def committed(self) -> None:
+        """Everything is stored."""
+        super().committed()
+        self._new = None
 
     def restore(self, time: int, arrays: Mapping[str, NDArray]) -> None:
         """Continue where a state was stored, anew if it is that of another version or monitor."""
@@ -166,26 +176,13 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
             evidence.astype(float),
         )
 
-    def refusal(self, moment: int, why: str) -> tuple[str, dict[str, Any]]:
-        """The entry of the log about a trajectory that is not used."""
-        return "event", self.entry(moment, what="trajectory", text=f"trajectory not used: {why}")
-
-    def _remarked(self, watched: WatchedTrajectories) -> int:
-        """Why the newest trajectory was not used as usual, as `_remark`."""
-        found = (i for i, name in enumerate(UNUSUAL, 1) if getattr(watched, name)[-1])
-        return next(found, 0)
-
-    def _with(self, samples: Samples) -> NDArray:
-        """The newest trajectories, with one more."""
-        new = np.array([[*samples.times[[0, -1]], len(samples.times)]], dtype=np.int64)
-        return np.concatenate([self._known, new])[-REMEMBERED:]
-
-    def _alarm(self, found: Diagnosed, watched: WatchedTrajectories, number: int) -> dict[str, Any]:
-        """An alarm with its cause, which is known at once."""
+    def _alarm(self, found: Diagnosed, watched: WatchedTrajectories, number: int) -> None:
+        """Log an alarm with its cause, which is known at once."""
         alarm, times = watched.alarms[number], found.samples.times
         unknown = alarm.shares.get(UNKNOWN, 0.0)
         cause = cause_data(alarm.name, alarm.probability, unknown, alarm.shares)
-        return self.entry(
+        self.log(
+            "alarm",
             int(times[-1]),
             sample=alarm.number,
             begin=int(times[0]),

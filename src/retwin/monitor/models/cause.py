@@ -19,6 +19,7 @@ from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
     ParameterDrift,
+    ParameterFault,
     ParameterShift,
     SensorBias,
     SensorDrift,
@@ -125,7 +126,8 @@ def possible_causes(
     twin : DynamicsTwin
         The twin of the monitor.
     faults : mapping of str to Fault or None, optional
-        Known faults, such as `Case.alarm_causes`; those that cannot be inverted are left out.
+        Known faults, such as `Case.alarm_causes`; those that cannot be inverted are left out, and
+        all where the twin has none of their parameters: it is a black box.
 
     Returns
     -------
@@ -134,6 +136,9 @@ def possible_causes(
 
     """
     known = {name: each for name, each in (faults or {}).items() if isinstance(each, TimedFault)}
+    used = {each.parameter for each in known.values() if isinstance(each, ParameterFault)}
+    if used and not used & {each.name for each in twin.equations.parameters}:
+        known = {}
     return {HEALTHY: None, **(known or _any_change(twin))}
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import finite, instance, positive, require
+from retwin.checks import finite, given, instance, positive
 from retwin.data.measured import check_magnitude
 from retwin.data.quality.check import check_records
 from retwin.data.quality.finding import summarise
@@ -86,12 +86,8 @@ def fit_monitor(
         sensor gives.
 
     """
-    twin = instance(
-        "twin",
-        _black_box(healthy) if twin is None else twin,
-        DynamicsTwin,
-        remedy="fit it by fit_dynamics",
-    )
+    model = _black_box(healthy) if twin is None else twin
+    twin = instance("twin", model, DynamicsTwin, remedy="fit it by fit_dynamics")
     check_channels(twin, healthy, "healthy")
     check_magnitude("healthy", healthy)
     arl = false_alarms(false_alarms_at_most, twin.rate)
@@ -101,15 +97,10 @@ def fit_monitor(
         warnings.warn(f"healthy: {note}", stacklevel=2)
     measured = np.where(healthy.mask, healthy.observed, np.nan).astype(float)
     steps = resolution(np.moveaxis(measured, 2, 0).reshape(measured.shape[2], -1))
+    expected = "records with which the filter of the twin stays finite"
+    remedy = "leave them out, or give the twin more substeps"
     first = _calibrated(twin, Predictor(), healthy, measured, steps)
-    require(
-        first is not None,
-        "healthy",
-        expected="records with which the filter of the twin stays finite",
-        got="others",
-        remedy="leave them out, or give the twin more substeps",
-    )
-    assert first is not None
+    first = given("healthy", first, expected, got="others", remedy=remedy)
     found = [first, *_slower(twin, healthy, measured, steps)]
     error, width = (_joined([getattr(each, of) for each in found]) for of in ("error", "width"))
     names, folds = _folds(healthy, np.isfinite(error).all(axis=0))
@@ -117,8 +108,8 @@ def fit_monitor(
     width = width / disturbance.deviation
     inputs, outputs = len(twin.inputs), len(twin.outputs)
     sizes = (inputs, len(DECAYS) * inputs, outputs)
-    given = _joined([first.features])
-    noise, mean, scale = fit_noise(disturbance.held_out, width, given.T, sizes, folds)
+    noted = _joined([first.features]).T
+    noise, mean, scale = fit_noise(disturbance.held_out, width, noted, sizes, folds)
     apart, width = (disturbance.held_out - mean) / scale, width / scale
     for each in np.array_split(np.arange(apart.shape[1]), len(healthy)):
         own = own_scale(np.zeros((len(apart), 2)), apart[:, each], noise.degrees)[0]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from itertools import count, takewhile
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 from numpy.typing import NDArray
 
 from retwin.monitor.detect.detector import DetectorState
@@ -14,6 +16,7 @@ from retwin.monitor.detect.events import Course
 from retwin.monitor.detect.validity import ValidityState
 from retwin.update.dynamics.online import FilterState
 
+Kind = TypeVar("Kind")
 PARTS = ("disturbance", "detector", "validity")
 """What the state of a monitor has of each stream."""
 
@@ -51,42 +54,43 @@ class MonitorState:
 
     def arrays(self) -> dict[str, NDArray]:
         """All arrays by name, whose first axis is that of machines."""
-        found = {
-            f"{_filter(number)}.{each.name}": getattr(own, each.name)
-            for number, own in enumerate(self.filters)
-            for each in fields(own)
-        }
+        count, found = len(self.void), dict[str, NDArray]()
+        for number, each_filter in enumerate(self.filters):
+            found |= arrays_of(_filter(number), each_filter)
         for name in PARTS:
-            value = getattr(self, name)
-            for each in fields(value):
-                array = getattr(value, each.name)
-                array = array.reshape(len(self.void), -1, *array.shape[1:])
-                found[f"{name}.{each.name}"] = array
-        found |= {f"course.{each.name}": getattr(self.course, each.name) for each in fields(Course)}
-        scale = self.scale.reshape(len(self.void), -1, 2)
+            own = arrays_of(name, getattr(self, name))
+            found |= {key: each.reshape(count, -1, *each.shape[1:]) for key, each in own.items()}
+        scale = self.scale.reshape(count, -1, 2)
+        found |= arrays_of("course", self.course)
         return found | {"changes": self.changes, "scale": scale, "void": self.void}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, NDArray]) -> MonitorState:
         """The state of what `arrays` gave, of some machines or of several joined."""
-
-        def part(name: str, kind: Any) -> Any:
-            own = {each.name: arrays[f"{name}.{each.name}"] for each in fields(kind)}
-            if name in PARTS:  # one row per stream
-                own = {key: each.reshape(-1, *each.shape[2:]) for key, each in own.items()}
-            return kind(**own)
-
-        filters = takewhile(lambda name: f"{name}.states" in arrays, map(_filter, count()))
+        rows = dict(arrays)
+        for key, each in arrays.items():
+            if key.split(".")[0] in (*PARTS, "scale"):  # a row of each stream
+                rows[key] = each.reshape(-1, *each.shape[2:])
+        filters = takewhile(lambda name: f"{name}.states" in rows, map(_filter, count()))
         return cls(
-            tuple(part(name, FilterState) for name in filters),
-            part("disturbance", DisturbanceState),
-            part("detector", DetectorState),
-            part("validity", ValidityState),
-            part("course", Course),
-            arrays["changes"],
-            arrays["scale"].reshape(-1, 2),
-            arrays["void"],
+            tuple(part_of(FilterState, name, rows) for name in filters),
+            part_of(DisturbanceState, "disturbance", rows),
+            part_of(DetectorState, "detector", rows),
+            part_of(ValidityState, "validity", rows),
+            part_of(Course, "course", rows),
+            *(rows[name] for name in ("changes", "scale", "void")),
         )
+
+
+def arrays_of(name: str, part: Any) -> dict[str, NDArray]:
+    """The arrays of a part of a state, by names that begin with that of the part."""
+    return {f"{name}.{each.name}": getattr(part, each.name) for each in fields(part)}
+
+
+def part_of(kind: type[Kind], name: str, arrays: Mapping[str, NDArray]) -> Kind:
+    """The part of a state of what `arrays_of` gave."""
+    own = {each.name: np.asarray(arrays[f"{name}.{each.name}"]) for each in fields(kind)}  # type: ignore[arg-type]
+    return kind(**own)
 
 
 def _filter(number: int) -> str:

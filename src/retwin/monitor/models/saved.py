@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from retwin.checks import finite, require
+from retwin.checks import finite
 from retwin.monitor.detect.disturbance import Disturbance
 from retwin.monitor.detect.noise import Noise
 from retwin.monitor.detect.predictors import Predictor
@@ -17,7 +17,7 @@ from retwin.monitor.detect.promise import Tried
 from retwin.monitor.detect.scores import ConformalScores
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.models.visible import Visible
-from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.serialisation.models import check_weights, read_model, refusing, write_model
 from retwin.update.dynamics.twin import DynamicsTwin
 
 KIND = "monitor"
@@ -63,26 +63,17 @@ def read_fields(folder: str | Path) -> dict[str, Any]:
         twin = DynamicsTwin.load(Path(folder) / "twin")
         predictors = tuple(Predictor(*each) for each in about["predictors"])
         streams = len(predictors) * len(twin.outputs)
-        parts = (
-            disturbance.mean,
-            scores.independent,
-            slack,
-            noise.mean,
-            noise.scale,
-            noise.degrees,
-        )
-        shapes = [len(each) for each in (*parts, arrays["resolution"])]
+        of_noise = noise.mean, noise.scale, noise.degrees
+        parts = disturbance.mean, scores.independent, slack, *of_noise, arrays["resolution"]
+        shapes = [len(each) for each in parts]
         values = (disturbance.coefficients, noise.mean, noise.scale, noise.low, noise.high)
-        require(
+        right = (
             shapes == [streams] * 6 + [len(twin.outputs)]
             and all(np.isfinite(each).all() for each in values)
             and (disturbance.process > 0).all()
-            and (disturbance.measurement >= 0).all(),
-            "weights",
-            expected=f"the calibration of {len(twin.outputs)} outputs",
-            got=shapes,
-            remedy="save the monitor again",
+            and (disturbance.measurement >= 0).all()
         )
+        check_weights(right, f"the calibration of {len(twin.outputs)} outputs", shapes)
         return {
             "twin": twin,
             "disturbance": disturbance,

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retwin.checks import finite, positive, require, whole
+from retwin.checks import finite, positive, whole
 from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.diagnoser import load_diagnoser
 from retwin.monitor.detect.detector import LARGEST, Detector
@@ -39,7 +39,7 @@ from retwin.monitor.models.trajectory_evidence import (
 from retwin.monitor.models.trajectory_state import TrajectoryState
 from retwin.monitor.models.watched_trajectories import TrajectoryAlarm, WatchedTrajectories
 from retwin.progress import Progress
-from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.serialisation.models import check_weights, read_model, refusing, write_model
 
 KIND = "trajectory_monitor"
 """Kind of the saved model."""
@@ -285,13 +285,9 @@ class TrajectoryMonitor:
             scores = ConformalScores.of_arrays(arrays, about["copies"])
             twin = twin_of(diagnoser)
             measured = arrays["measured"]
-            require(
-                len(scores.independent) == 1 and measured.shape == (2, len(twin.outputs)),
-                "weights",
-                expected=f"the calibration of one stream with {len(twin.outputs)} outputs",
-                got=f"{len(scores.independent)}, {measured.shape}",
-                remedy="save the monitor again",
-            )
+            shapes = len(scores.independent), measured.shape
+            expected = f"the calibration of one stream with {len(twin.outputs)} outputs"
+            check_weights(shapes == (1, (2, len(twin.outputs))), expected, shapes)
             return cls(
                 diagnoser,
                 scores,

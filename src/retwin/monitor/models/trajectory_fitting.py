@@ -22,13 +22,12 @@ from retwin.monitor.models.trajectory_evidence import (
 )
 from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault
+from retwin.update.dynamics.noise import CERTAIN
 
 MIN_TRAJECTORIES = 8
 """Healthy trajectories of a calibration, at least."""
 FACTORS = np.arange(1.0, 10.005, 0.01)
 """Factors of the errors of which the smallest is taken with which the calibration agrees."""
-CERTAIN = 1.645
-"""Standard errors up to which the calibration may disagree: 95 %, one-sided."""
 
 
 def fit_trajectory_monitor(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from retwin.checks import instance, require
 from retwin.monitor.detect.detector import DetectorState
 from retwin.monitor.detect.validity import ValidityState
+from retwin.monitor.models.monitor_state import arrays_of, part_of
 from retwin.serialisation.files import refusing
 
 
@@ -40,24 +41,17 @@ class TrajectoryState:
     def arrays(self) -> dict[str, NDArray]:
         """All of it as arrays by name, from which `of_arrays` makes the same again."""
         made = {"evidence": self.evidence, "pooled": self.pooled, "count": np.array([self.count])}
-        for part in ("detector", "validity"):
-            own = getattr(self, part)
-            made |= {f"{part}.{each.name}": getattr(own, each.name) for each in fields(own)}
-        return made
+        return made | arrays_of("detector", self.detector) | arrays_of("validity", self.validity)
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray]) -> TrajectoryState:
         """The state of arrays; InputError if they are of none."""
         with refusing("state", expected="the arrays of a state", remedy="begin with no state"):
-            detector, validity = (
-                {each.name: np.asarray(arrays[f"{part}.{each.name}"]) for each in fields(kind)}
-                for part, kind in (("detector", DetectorState), ("validity", ValidityState))
-            )
             return cls(
                 np.asarray(arrays["evidence"]),
                 np.asarray(arrays["pooled"]),
-                DetectorState(**detector),
-                ValidityState(**validity),
+                part_of(DetectorState, "detector", arrays),
+                part_of(ValidityState, "validity", arrays),
                 int(arrays["count"][0]),
             )
 

@@ -20,8 +20,6 @@ else:
     uvicorn = needs_extra("uvicorn", "monitor", "serves the monitor's page")
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
-PORT = 8710
-"""The port unless another one is given."""
 PATIENCE = 3
 """Seconds for which requests are finished at the end."""
 HEADERS = 10.0

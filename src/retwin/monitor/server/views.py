@@ -26,9 +26,8 @@ from retwin.monitor.server.journal import Journal
 from retwin.monitor.store.gridded import gridded
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.versions.registry import Registry
+from retwin.update.dynamics.noise import CERTAIN
 
-BAND = 1.645
-"""Half the width of the 90 % band of a Gaussian, in its standard deviations."""
 SILENT = 20
 """Sample periods without a new sample after which an asset counts as stopped, 30 s at least."""
 SILENT_SECONDS = 30.0
@@ -177,23 +176,19 @@ class Views:
             "alarm": alarm is not None,
             "void": status.void,
             "stopped": status.time is not None and idle > silent,
+            "impossible": bool(status.impossible),
             "rate": bool(status.rate),
             "outside": status.outside,
             "ok": True,
         }
         return {
-            "asset": status.asset,
-            "twin": status.twin,
-            "version": status.version,
+            **{name: getattr(status, name) for name in SHARED},
             "time": None if status.time is None else status.time / SECOND,
             "evidence": status.ratio,
-            "event": status.event,
             "void_since": self.journal.void(status.asset) if status.void else None,
             "alarm": None if alarm is None else self._explained(alarm, twins),
             "state": next(name for name, holds in states.items() if holds),
-            "rate": status.rate,
             "idle": idle,
-            "counts": status.counts,
         }
 
     def _explained(self, alarm: Mapping[str, Any], twins: Mapping[str, str]) -> dict[str, Any]:
@@ -233,7 +228,7 @@ def _channels(monitor: AnyMonitor) -> tuple[Named, Named]:
 
 def _drawn(inputs: Named, outputs: Named, recent: Recent, part: slice) -> dict[str, Any]:
     """What plots of samples need."""
-    mean, half = recent.mean[part], BAND * recent.deviation[part]
+    mean, half = recent.mean[part], CERTAIN * recent.deviation[part]
     return {
         "inputs": inputs,
         "outputs": outputs,
@@ -246,7 +241,9 @@ def _drawn(inputs: Named, outputs: Named, recent: Recent, part: slice) -> dict[s
     }
 
 
-ORDER = ("alarm", "void", "stopped", "rate", "outside", "ok")
+SHARED = ("asset", "twin", "version", "event", "rate", "impossible", "counts")
+"""What the page shows of a status as it is."""
+ORDER = ("alarm", "void", "impossible", "stopped", "rate", "outside", "ok")
 """The states of assets, the worst first."""
 
 

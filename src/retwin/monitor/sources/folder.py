@@ -5,9 +5,10 @@ from __future__ import annotations
 import glob
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from itertools import takewhile
 from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
 
 from retwin.errors import InputError
 from retwin.monitor.live.gate import Gate
@@ -22,17 +23,19 @@ OVERLAP = 60 * 10**9
 is older is not used any more, and what is stored already is recognised."""
 
 
-class Files(Source):
+Read = TypeVar("Read")
+"""How the files of a machine are read."""
+
+
+class Files(Source, Generic[Read]):
     """The files of a pattern, of one machine or of several.
 
     Parameters
     ----------
-    kind : str
-        What lines that are reported begin with, before the pattern.
     settings : FolderSource
         Its pattern is absolute.
-    assets : collection of str
-        The machines.
+    machines : mapping of str to Layout or Recorded
+        How each machine's files are read.
     newest : mapping of str to int
         Time of the newest stored sample of each machine that has any, in ns.
     report : callable
@@ -40,25 +43,29 @@ class Files(Source):
 
     """
 
+    kind: ClassVar[str]
+    """What lines that are reported begin with, before the pattern."""
+
     def __init__(
         self,
-        kind: str,
         settings: FolderSource,
-        assets: Collection[str],
+        machines: Mapping[str, Read],
         newest: Mapping[str, int],
         report: Callable[[str], None],
     ) -> None:
-        super().__init__(f"{kind} {settings.files}", report)
+        super().__init__(f"{self.kind} {settings.files}", report)
         self._settings = settings
-        self._assets = assets
+        self._machines = machines
         self._newest = newest
+        self._known: dict[tuple[str, str], Any] = {}
+        """What is known of each machine's files by their paths."""
 
     def run(self, gate: Gate, stop: threading.Event) -> None:
         """Read the files again and again, until `stop` is set."""
         while not stop.is_set():
             patterns = {
                 asset: self._settings.files.replace("{asset}", glob.escape(asset))
-                for asset in self._assets
+                for asset in self._machines
             }
             bases = {asset: _base(pattern) for asset, pattern in patterns.items()}
             missing = sorted({str(base) for base in bases.values() if not base.is_dir()})
@@ -71,6 +78,11 @@ class Files(Source):
                     self._read(asset, sorted(glob.glob(pattern, recursive=True)), gate, stop)
             stop.wait(self._settings.every)
 
+    def _forget(self, asset: str, paths: list[str]) -> None:
+        """Forget the files of a machine that are not there any more."""
+        for key in [key for key in self._known if key[0] == asset and key[1] not in paths]:
+            del self._known[key]
+
     @abstractmethod
     def _read(self, asset: str, paths: list[str], gate: Gate, stop: threading.Event) -> None:
         """Send what is new in the files of a machine."""
@@ -82,44 +94,22 @@ def _base(pattern: str) -> Path:
     return Path(*takewhile(lambda part: not glob.has_magic(part), parts))
 
 
-class Folder(Files):
+class Folder(Files[Layout]):
     """The files of a pattern, as samples of one machine or of several.
 
     Files of a machine are read in the order of their first unread rows. How far each was read is
     not stored: after a restart, rows up to a minute before the newest stored sample are left out.
-
-    Parameters
-    ----------
-    settings : FolderSource
-        Its pattern is absolute.
-    layouts : mapping of str to Layout
-        The columns of each machine's files.
-    newest : mapping of str to int
-        Time of the newest stored sample of each machine that has any, in ns.
-    report : callable
-        Takes a line about an event.
-
     """
 
-    def __init__(
-        self,
-        settings: FolderSource,
-        layouts: Mapping[str, Layout],
-        newest: Mapping[str, int],
-        report: Callable[[str], None],
-    ) -> None:
-        super().__init__("folder", settings, layouts, newest, report)
-        self._layouts = layouts
-        self._tables: dict[tuple[str, str], GrowingTable] = {}
+    kind = "folder"
 
     def _list_changed(self, asset: str, paths: list[str]) -> list[GrowingTable]:
         """The files of a machine that were written to, in the order of their new rows."""
-        for key in [key for key in self._tables if key[0] == asset and key[1] not in paths]:
-            del self._tables[key]
+        self._forget(asset, paths)
         found = []
         for path in paths:
-            table = self._layouts[asset].table(Path(path))
-            table = self._tables.setdefault((asset, path), table)
+            table = self._machines[asset].table(Path(path))
+            table = self._known.setdefault((asset, path), table)
             try:
                 if table.changed():
                     first = next((rows.times[0] for rows in table.rows() if len(rows.times)), None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from retwin.data.io import load
 from retwin.errors import InputError
 from retwin.monitor.live.gate import Gate
 from retwin.monitor.models.trajectories import TrajectoryMonitor
-from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.folder import Files
 from retwin.monitor.sources.layouts import layout_of
 from retwin.monitor.store.samples import LONGEST, SECOND, Trajectory, places
@@ -33,50 +31,33 @@ class Recorded:
     case: Case | None = None
 
 
-class TrajectoryFolder(Files):
+@dataclass
+class _File:
+    """What a file is, since when, and what it was when it was read."""
+
+    state: tuple[int, ...]
+    since: float
+    read: tuple[int, ...] = ()
+
+
+class TrajectoryFolder(Files[Recorded]):
     """The files of a pattern, as trajectories of one machine or of several.
 
     A file is read once it is complete: its last change was `settle` seconds ago, by the clock or as
     long as this has watched it. One that changes afterwards is read again; what is stored already
-    is recognised by its begin.
-
-    Parameters
-    ----------
-    settings : FolderSource
-        Its pattern is absolute.
-    machines : mapping of str to Recorded
-        How each machine's files are read.
-    newest : mapping of str to int
-        Time of the newest stored sample of each machine that has any, in ns: trajectories that
-        begin earlier are left out.
-    report : callable
-        Takes a line about an event.
-
+    is recognised by its begin, and trajectories before the newest stored sample are left out.
     """
 
-    def __init__(
-        self,
-        settings: FolderSource,
-        machines: Mapping[str, Recorded],
-        newest: Mapping[str, int],
-        report: Callable[[str], None],
-    ) -> None:
-        super().__init__("trajectories", settings, machines, newest, report)
-        self._machines = machines
-        self._seen: dict[tuple[str, str], tuple[tuple[int, ...], float]] = {}
-        """What a file was, and since when."""
-        self._done: dict[tuple[str, str], tuple[int, ...]] = {}
+    kind = "trajectories"
 
     def _read(self, asset: str, paths: list[str], gate: Gate, stop: threading.Event) -> None:
         """Send the trajectories of complete files in the order of their begins."""
-        for key in [key for key in self._seen if key[0] == asset and key[1] not in paths]:
-            del self._seen[key]
-            self._done.pop(key, None)
+        self._forget(asset, paths)
         found: list[tuple[int, Trajectory]] = []
         read: list[tuple[str, tuple[int, ...]]] = []
         for path in paths:
             now = self._complete(asset, path)
-            if now is None or self._done.get((asset, path)) == now:
+            if now is None or self._known[asset, path].read == now:
                 continue
             try:
                 made = self._trajectories(asset, Path(path), now[-1])
@@ -90,7 +71,7 @@ class TrajectoryFolder(Files):
             if not self.stored(gate, each, stop):
                 return
         for path, now in read:
-            self._done[asset, path] = now
+            self._known[asset, path].read = now
 
     def _complete(self, asset: str, path: str) -> tuple[int, ...] | None:
         """What a file is, if it is complete: its number, size and time of change in ns."""
@@ -100,11 +81,10 @@ class TrajectoryFolder(Files):
             return None  # it was removed meanwhile
         now = (about.st_ino, about.st_size, about.st_mtime_ns)
         clock = time.monotonic()
-        before, since = self._seen.get((asset, path), (None, clock))
-        if before != now:
-            since = clock
-            self._seen[asset, path] = now, since
-        age = max(clock - since, time.time() - about.st_mtime)
+        file = self._known.setdefault((asset, path), _File(now, clock))
+        if file.state != now:
+            file.state, file.since = now, clock
+        age = max(clock - file.since, time.time() - about.st_mtime)
         return now if age >= self._settings.settle else None
 
     def _trajectories(self, asset: str, path: Path, changed: int) -> list[Trajectory]:

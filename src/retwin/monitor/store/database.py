@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -149,11 +149,9 @@ class Database:
             self._writer = None
         self._engine.dispose()
 
-    @contextmanager
-    def reader(self) -> Iterator[Any]:
-        """A connection for one or a few statements that read."""
-        with self._engine.connect() as connection:
-            yield connection
+    def reader(self) -> sa.Connection:
+        """A connection for one or a few statements that read; a context manager that closes it."""
+        return self._engine.connect()
 
     @contextmanager
     def writer(self) -> Iterator[Any]:
@@ -257,13 +255,12 @@ class Database:
         self._require_durable(found, PRAGMAS, "put the store on a local disk")
 
     def _prepare_postgresql(self, raw: Any, _: Any) -> None:
-        with ExitStack() as ended:
-            ended.callback(raw.commit)
-            cursor = ended.enter_context(raw.cursor())
+        with raw.cursor() as cursor:
             cursor.execute("SET synchronous_commit = on")
             if self._read_only:
                 cursor.execute("SET default_transaction_read_only = on")
             found = {name: cursor.execute(f"SHOW {name}").fetchone()[0] for name in SERVER}
+        raw.commit()
         self._require_durable(found, SERVER, "change the settings of the server")
 
     def _require_durable(self, found: dict, needed: dict, remedy: str) -> None:

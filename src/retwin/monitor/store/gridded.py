@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from retwin.arrays import held
 from retwin.data.trajectories import Trajectories
+from retwin.monitor.store.limits import Limits
 from retwin.monitor.store.samples import SECOND, places
 from retwin.monitor.store.store import Store
 from retwin.monitor.store.updates import EARLIEST
@@ -34,8 +35,8 @@ def gridded(
     Returns
     -------
     NDArray, NDArray
-        From the first sample with all commands on; NaN where there is no sample. A command that is
-        missing later is the one before.
+        From the first sample with all commands on; NaN where there is no sample, or a value that
+        is outside the limits of its channel. A command that is missing later is the one before.
 
     """
     commands = len(twin.inputs)
@@ -45,7 +46,9 @@ def gridded(
         values.append(rows[part <= last])
         if part[-1] > last:
             break
-    found, given = np.concatenate(times), np.concatenate(values)
+    settings = next(each.settings for each in store.assets() if each.name == asset)
+    limits = Limits.of(twin, settings.get("limits", {}))
+    found, given = np.concatenate(times), limits.kept(np.concatenate(values))
     begun = np.logical_or.accumulate(np.isfinite(given[:, :commands]).all(axis=1))
     found, given = found[begun], given[begun]
     if not len(found):

@@ -239,21 +239,15 @@ class Store:
 
         """
         key, channels = self._asset(asset)
-        low = EARLIEST if after is None else whole("after", after, least=EARLIEST, most=LATEST)
-        chosen = samples.select().where(samples.c.asset == key).order_by(samples.c.time)
-        inclusive = after is None
-        while True:
-            later = samples.c.time >= low if inclusive else samples.c.time > low
-            with self._reading() as connection:
-                rows = connection.execute(chosen.where(later).limit(ROWS)).all()
-            if not rows:
-                return
+        if after is not None:
+            whole("after", after, least=EARLIEST, most=LATEST)
+        chosen = samples.select().where(samples.c.asset == key)
+        for rows in self._parts(chosen, samples.c.time, after):
             times = np.array([row.time for row in rows], dtype=np.int64)
             with refusing(f"samples of {asset}", expected="stored values", remedy="restore a copy"):
                 joined = b"".join(row.packed for row in rows)
                 values = np.frombuffer(joined, WORD).reshape(len(rows), channels)
             yield times, values.astype(float)
-            low, inclusive = int(times[-1]), False
 
     def state(self, asset: str) -> tuple[int, dict[str, NDArray]] | None:
         """Stream time in nanoseconds and arrays of the last state of an asset; None without one."""
@@ -280,18 +274,26 @@ class Store:
 
         With `after`, only those whose sequence, from 0 on, is larger.
         """
-        chosen = log.select().order_by(log.c.sequence).limit(ROWS)
-        if kind is not None:
-            chosen = chosen.where(log.c.kind == kind)
-        low = after
-        while True:
-            with self._reading() as connection:
-                rows = connection.execute(chosen.where(log.c.sequence > low)).all()
-            if not rows:
-                return
+        chosen = log.select() if kind is None else log.select().where(log.c.kind == kind)
+        for rows in self._parts(chosen, log.c.sequence, after):
             for row in rows:
                 yield Entry(row.sequence, row.kind, row.text, row.previous, row.hash)
-            low = rows[-1].sequence
+
+    def _parts(
+        self, chosen: sa.Select, key: sa.Column, last: int | None
+    ) -> Iterator[Sequence[Any]]:
+        """Rows in the order of a key, after a value of it, part by part.
+
+        No connection is held while a part is used, which may take long.
+        """
+        while True:
+            later = chosen if last is None else chosen.where(key > last)
+            with self._reading() as connection:
+                rows = connection.execute(later.order_by(key).limit(ROWS)).all()
+            if not rows:
+                return
+            yield rows
+            last = int(rows[-1]._mapping[key])
 
     @property
     def head(self) -> str:

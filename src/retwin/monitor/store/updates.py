@@ -118,14 +118,9 @@ def pack(update: Update, known: Mapping[str, tuple[int, int]]) -> Packed:
         times, values = np.asarray(update.times), np.asarray(update.values, dtype=WORD)
         if times.size == 0:
             times, values = np.empty(0, np.int64), values.reshape(0, channels)
-        shapes = (times.shape, values.shape)
-        require(
-            times.dtype.kind == "i" and shapes == ((len(times),), (len(times), channels)),
-            where,
-            expected=expected,
-            got=f"{times.dtype} {shapes[0]} and {shapes[1]}",
-            remedy=remedy,
-        )
+        got, shapes = f"{times.dtype} {times.shape} and {values.shape}", (times.shape, values.shape)
+        right = times.dtype.kind == "i" and shapes == ((len(times),), (len(times), channels))
+        require(right, where, expected=expected, got=got, remedy=remedy)
         # C order, since the writer takes the memory of an array as it lies.
         arrays = {name: np.asarray(each, order="C") for name, each in (update.state or {}).items()}
         blob = save(arrays)

@@ -2,27 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import agree, given, require
+from retwin.data.trajectories import Trajectories
+from retwin.diagnosis.inversion import InversionDiagnoser
+from retwin.evaluation.fidelity.simulation import simulate_records
 from retwin.monitor.detect.promise import FalseAlarmTest
 from retwin.monitor.models.cause import BEFORE
 from retwin.monitor.models.kinds import load_monitor
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.trajectories import TrajectoryMonitor
-from retwin.monitor.store.gridded import gridded
+from retwin.monitor.store.gridded import gridded, record_of
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.store.store import Store
 from retwin.monitor.versions.decision import MIN_SAMPLES, Decision, decide, padded
 from retwin.monitor.versions.registry import Registry
-from retwin.monitor.versions.trajectory_comparison import compared_trajectories
+from retwin.scores.bootstrap import BLOCKS
 from retwin.scores.distributions import crps_normal
+from retwin.twins.twin import Twin
+from retwin.update.corrected import CorrectedTwin
 
 MAX_SAMPLES = 20_000
 """Newest samples of each asset that are compared, which bounds time and memory."""
+MIN_TRAJECTORIES, MAX_TRAJECTORIES = 2 * BLOCKS, 6 * BLOCKS
+"""Healthy trajectories of all assets together that are compared: at least, so that a block of the
+bootstrap has two, and at most, since diagnosing each may take seconds."""
+TRAJECTORIES_BEFORE = 10
+"""Trajectories before an alarm that are left out: its cause may already act in them."""
+DRAWS = 200
+"""Simulations of each trajectory; the CRPS has no bias by their number."""
 KINDS: Mapping[type, str] = {Monitor: "samples", TrajectoryMonitor: "trajectories"}
 
 
@@ -72,33 +86,33 @@ def compare(store: Store, twin: str, number: int) -> Decision:
     first = registry.reference
     others = [first.number] if first and first.number not in (active.number, number) else []
     watching = [old, new, *(load_monitor(registry.folder(each)) for each in others)]
-    if isinstance(old, TrajectoryMonitor):
-        return compared_trajectories(
-            store, twin, *(each for each in watching if isinstance(each, TrajectoryMonitor))
-        )
-    return _compared_streams(store, twin, *(each for each in watching if isinstance(each, Monitor)))
+    scored = _of_trajectories if isinstance(old, TrajectoryMonitor) else _of_samples
+    scores, (test, *beside) = scored(store, twin, watching)
+    old_crps, new_crps = map(padded, zip(*scores, strict=True))
+    return decide(old_crps, new_crps, test, reference=beside[0] if beside else None)
 
 
-def _compared_streams(
-    store: Store, twin: str, old: Monitor, new: Monitor, reference: Monitor | None = None
-) -> Decision:
-    scores, alarms, of_reference = [], 0, 0
-    for part in _healthy(store, twin, old):
+Scored = tuple[Sequence[ArrayLike], list[FalseAlarmTest]]
+"""The CRPS (2, T) of the old and the new version in each record; and the tests of the new version
+and of the reference, if there is one."""
+
+
+def _of_samples(store: Store, twin: str, watching: Sequence[Any]) -> Scored:
+    """One-step predictions of the old version, the new one and the reference."""
+    old, scores, alarms = watching[0], [], np.zeros(len(watching), dtype=int)
+    for part in _healthy_samples(store, twin, old):
         if len(part) < 2 * MIN_SAMPLES:
             continue
         commands, measured = np.split(part[None], [len(old.twin.inputs)], axis=2)
-        seen = [each.step(each.start(1), commands, measured)[1] for each in (old, new)]
+        seen = [each.step(each.start(1), commands, measured)[1] for each in watching]
         if seen[0].events:  # an alarm that was not raised when the samples came, after another one
             continue
         known = np.where(np.isfinite(seen[0].score) & np.isfinite(seen[1].score), measured, np.nan)
         unit = np.nanstd(measured, axis=1, keepdims=True)
         unit = np.where(unit > 0, unit, 1.0)
-        found = [crps_normal(known, each.mean, each.deviation) for each in seen]
+        found = [crps_normal(known, each.mean, each.deviation) for each in seen[:2]]
         scores.append([_mean((each / unit)[0]) for each in found])
-        alarms += len(seen[1].events)
-        if reference is not None:
-            seen = [reference.step(reference.start(1), commands, measured)[1]]
-            of_reference += len(seen[0].events)
+        alarms += [len(each.events) for each in seen]
     require(
         scores,
         "samples",
@@ -106,13 +120,40 @@ def _compared_streams(
         got="fewer",
         remedy="compare the versions later",
     )
-    old_crps, new_crps = map(padded, zip(*scores, strict=True))
-    samples = int(np.isfinite(new_crps).sum())
-    test = FalseAlarmTest(alarms, max(samples, 1), new.arl)
-    beside = None
-    if reference is not None:
-        beside = FalseAlarmTest(of_reference, max(samples, 1), reference.arl)
-    return decide(old_crps, new_crps, test, reference=beside)
+    samples = max(sum(int(np.isfinite(each[1]).sum()) for each in scores), 1)
+    counted = list(zip(alarms.tolist(), watching, strict=True))[1:]
+    return scores, [FalseAlarmTest(count, samples, each.arl) for count, each in counted]
+
+
+def _of_trajectories(store: Store, twin: str, watching: Sequence[Any]) -> Scored:
+    """Simulations of trajectories from their commands, each scored by its mean CRPS.
+
+    It is the mean over samples and outputs, each output in the unit of its standard deviation. What
+    is resampled are 16 blocks or more of consecutive trajectories of one asset, since those of a
+    machine that changes slowly resemble each other.
+    """
+    old = watching[0]
+    machines = [
+        [record_of(old.twin, each) for each in part]
+        for part in _healthy_trajectories(store, twin, old)
+    ]
+    every = [each for part in machines for each in part]
+    require(
+        len(every) >= MIN_TRAJECTORIES,
+        "trajectories",
+        expected=f"at least {MIN_TRAJECTORIES} healthy ones that are stored, of all machines "
+        "together",
+        got=len(every),
+        remedy="compare the versions later",
+    )
+    unit = _deviation(every)
+    twins = [_predicting(each) for each in watching[:2]]
+    length = len(every) // BLOCKS
+    scores: list[NDArray] = []
+    for part in machines:
+        pairs = np.array([[_crps(own, each, unit) for each in part] for own in twins])
+        scores += np.array_split(pairs, max(1, len(part) // length), axis=1)
+    return scores, [_tested(each, machines) for each in watching[1:]]
 
 
 def _mean(scores: NDArray) -> NDArray:
@@ -123,20 +164,92 @@ def _mean(scores: NDArray) -> NDArray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _healthy(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
-    """The healthy samples (T, d_u + d_y) of each asset of a twin."""
-    alarms: dict[str, list[int]] = {}
-    for entry in (*store.log("alarm"), *store.log("remark"), *store.log("end")):
-        alarms.setdefault(entry.data["asset"], []).append(entry.data["time"])
+def _machines(store: Store, twin: str) -> Iterator[tuple[str, int, Mapping[str, NDArray]]]:
+    """Name, newest time and state of each asset of a twin that has one."""
     for asset in store.assets():
-        newest = store.state(asset.name)
-        if asset.settings.get("twin") == twin and newest is not None:
-            period = SECOND / monitor.twin.rate
-            first = newest[0] - round(MAX_SAMPLES * period)
-            times, rows = gridded(store, asset.name, monitor.twin, first, newest[0])
-            ends = np.searchsorted(times, sorted(alarms.get(asset.name, [])))
-            ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))
-            first = int(np.argmax(np.diff(ends))) if len(ends) > 1 else 0
-            part = rows[ends[first] : ends[first + 1] - BEFORE]
-            known = np.isfinite(part[:, : len(monitor.twin.inputs)]).all(axis=1)
-            yield part[int(np.argmax(known)) :] if known.any() else part[:0]
+        state = store.state(asset.name)
+        if asset.settings.get("twin") == twin and state is not None:
+            yield asset.name, *state
+
+
+def _moments(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
+    """The times of that name of the entries of some kinds of the log, by their assets."""
+    found: dict[str, list[int]] = {}
+    for entry in (each for kind in kinds for each in store.log(kind)):
+        if key in entry.data:
+            found.setdefault(entry.data["asset"], []).append(entry.data[key])
+    return found
+
+
+def _healthy_samples(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
+    """The healthy samples (T, d_u + d_y) of each asset of a twin."""
+    alarms, period = _moments(store, "time", "alarm", "remark", "end"), SECOND / monitor.twin.rate
+    for name, newest, _ in _machines(store, twin):
+        first = newest - round(MAX_SAMPLES * period)
+        times, rows = gridded(store, name, monitor.twin, first, newest)
+        ends = np.searchsorted(times, sorted(alarms.get(name, [])))
+        ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))
+        first = int(np.argmax(np.diff(ends))) if len(ends) > 1 else 0
+        part = rows[ends[first] : ends[first + 1] - BEFORE]
+        known = np.isfinite(part[:, : len(monitor.twin.inputs)]).all(axis=1)
+        yield part[int(np.argmax(known)) :] if known.any() else part[:0]
+
+
+def _tested(monitor: TrajectoryMonitor, machines: list[list[Trajectories]]) -> FalseAlarmTest:
+    """The alarms of a monitor on healthy trajectories, those of each machine in their order."""
+    alarms = count = 0
+    for part in machines:
+        state = monitor.start()
+        for each in part:
+            state, found = monitor.watch(each, state)
+            alarms += len(found.alarms)
+            count += int((~found.unmeasured).sum())
+    return FalseAlarmTest(alarms, count, monitor.arl, "trajectories")
+
+
+def _healthy_trajectories(
+    store: Store, twin: str, monitor: TrajectoryMonitor
+) -> Iterator[list[NDArray]]:
+    """The longest healthy part of each asset: trajectories (T, d_u + d_y) that follow each other.
+
+    Those with nothing measured are left out.
+    """
+    alarms, machines = _moments(store, "begin", "alarm"), list(_machines(store, twin))
+    for asset, _, state in machines:
+        known = state.get("trajectories", np.zeros((0, 3), dtype=np.int64))
+        ends = np.flatnonzero(np.isin(known[:, 0], alarms.get(asset, [])))
+        begins = np.concatenate([[0], ends + 1])
+        lasts = np.maximum(np.concatenate([ends - TRAJECTORIES_BEFORE, [len(known)]]), begins)
+        longest = int(np.argmax(lasts - begins))
+        part = known[begins[longest] : lasts[longest]][-max(1, MAX_TRAJECTORIES // len(machines)) :]
+        made = []
+        for begin, last, count in part.tolist():
+            _, rows = gridded(store, asset, monitor.twin, begin, last)
+            if len(rows) == count and np.isfinite(rows[:, len(monitor.twin.inputs) :]).any():
+                made.append(rows)
+        yield made
+
+
+def _predicting(monitor: TrajectoryMonitor) -> Twin:
+    """The corrected twin of a monitor's diagnoser, whose outputs are random."""
+    own = monitor.diagnoser
+    if isinstance(own, InversionDiagnoser):
+        return CorrectedTwin(own.surrogate, own.residual)
+    return own.twin
+
+
+def _deviation(records: list[Trajectories]) -> NDArray:
+    """The standard deviation (d_y,) of what was measured of each output; 1 for a constant one."""
+    measured = np.concatenate([np.where(each.mask, each.observed, np.nan)[0] for each in records])
+    seen = np.isfinite(measured).any(axis=0)
+    found = np.ones(measured.shape[1])
+    found[seen] = np.nanstd(measured[:, seen].astype(float), axis=0)
+    return np.where(found > 0, found, 1.0)
+
+
+def _crps(twin: Twin, record: Trajectories, unit: NDArray) -> float:
+    """The mean CRPS of a trajectory over its measured samples and outputs."""
+    with warnings.catch_warnings():  # both versions see the same commands
+        warnings.simplefilter("ignore")
+        found = simulate_records(twin, record, draws=DRAWS, seed=0).crps[0] / unit
+    return float(found[record.mask[0]].mean())

@@ -182,7 +182,18 @@ class Registry:
 
         """
         with self._store.lock:
-            return self._promoted(number, evidence)
+            if self.active is None:
+                return self._step("promote", number, first=True)
+            decision = instance("evidence", evidence, Decision, remedy="compare both with decide()")
+            require(
+                decision.better,
+                "evidence",
+                expected="a difference in CRPS whose 95 % interval is above 0, and alarms as "
+                "promised",
+                got=decision.summary,
+                remedy="keep the active version, or collect more samples",
+            )
+            return self._step("promote", number, evidence=asdict(decision))
 
     def rollback(self, reason: str = "") -> Version:
         """Make the version active that was so before the active one, which is retired."""
@@ -218,19 +229,6 @@ class Registry:
             found == version.digest, str(place), expected=expected, got="other bytes", remedy=remedy
         )
         return place
-
-    def _promoted(self, number: int, evidence: Decision | None) -> Version:
-        if self.active is None:
-            return self._step("promote", number, first=True)
-        decision = instance("evidence", evidence, Decision, remedy="compare both with decide()")
-        require(
-            decision.better,
-            "evidence",
-            expected="a difference in CRPS whose 95 % interval is above 0, and alarms as promised",
-            got=decision.summary,
-            remedy="keep the active version, or collect more samples",
-        )
-        return self._step("promote", number, evidence=asdict(decision))
 
     def _version(self, number: int) -> Version:
         versions = self._read()[0]
@@ -271,23 +269,12 @@ class Registry:
 
     def _copy(self, source: Path) -> str:
         """The hash of a folder, after it was copied under that name unless it was before."""
-        require(
-            source.is_dir() and not source.is_symlink(),
-            "folder",
-            expected="the folder of a saved model",
-            got=f"{source}, which is none",
-            remedy="save the model first",
-        )
         refused = "a folder of files that can be read"
         with refusing(source, expected=refused, remedy="save the model again"):
-            files = list(_files(source))
-            require(
-                files,
-                "folder",
-                expected="the folder of a saved model",
-                got=f"{source}, which is empty",
-                remedy="save the model first",
-            )
+            there = source.is_dir() and not source.is_symlink()
+            files = list(_files(source)) if there else []
+            wanted, got = "the folder of a saved model", f"{source}, which is empty or none"
+            require(files, "folder", expected=wanted, got=got, remedy="save the model first")
             Budget("folder", disk=self._store.folder).take(sum(f.stat().st_size for f in files))
             digest = sha256(source)
             place = self._store.folder / FOLDER / digest

@@ -102,7 +102,7 @@
 
   // What is common to several pages.
   const TONES = { alarm: ["alarm", "Alarm"], void: ["wait", "Promise void"], stopped: ["wait", "No samples"],
-    outside: ["wait", "Outside calibration"], rate: ["wait", "Other rate"], ok: ["ok", "As predicted"] };
+    outside: ["wait", "Outside calibration"], rate: ["wait", "Other rate"], impossible: ["wait", "Impossible value"], ok: ["ok", "As predicted"] };
   const tone = (asset) => TONES[asset.state] || TONES.ok;
   const badge = (asset) => h("span", { class: `badge ${tone(asset)[0]}` }, tone(asset)[1]);
   const fill = (part, value) => part.style.setProperty("--part", `${100 * Math.min(1, Math.max(0, value))}%`);
@@ -330,6 +330,7 @@
         void: () => [`The promise is VOID${now.void_since ? ` since ${stamp(now.void_since)}` : ""}: the machine is not the one of the calibration. What is seen are remarks, not alarms.`, "Look for a fault first: a calibration would take it for healthy. Only if the machine is healthy, recalibrate."],
         stopped: () => [`No new sample has arrived for ${span(now.idle)}.`, "Check the source of the samples and its connection."],
         outside: () => ["Commands leave the range of the calibration, where the twin extrapolates.", "Calibrate on records that have such commands."],
+        impossible: () => [`Impossible values: ${now.impossible}.`, "They are not used. Check the sensor, its line and its converter."],
         rate: () => ["Samples arrive at another rate than the twin's.", now.rate],
         ok: () => ["What is measured agrees with the twin."],
       };

@@ -1,0 +1,50 @@
+"""`Limits`: which values channels can have physically; another one is no measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import one_of
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """The limits of d channels, commands first: `low` and `high` (d,), infinite where none are."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    low: NDArray
+    high: NDArray
+
+    @classmethod
+    def of(cls, twin: Any, declared: Mapping[str, Sequence[float]]) -> Limits:
+        """Those that are declared for channels of a twin; InputError for another channel."""
+        names = (*twin.inputs.names, *twin.outputs.names)
+        units = (*twin.inputs.units, *twin.outputs.units)
+        low, high = np.full((2, len(names)), [[-np.inf], [np.inf]])
+        for name, (least, most) in declared.items():
+            place = names.index(one_of("limits", name, names))
+            low[place], high[place] = least, most
+        return cls(names, units, low, high)
+
+    def outside(self, values: NDArray) -> NDArray:
+        """Whether values (..., d) are impossible; one that is missing is not."""
+        return np.asarray((values < self.low) | (values > self.high))
+
+    def kept(self, values: NDArray) -> NDArray:
+        """Values (..., d) of which those that are impossible are missing."""
+        return np.where(self.outside(values), np.nan, values)
+
+    def text(self, place: int, value: float | None = None) -> str:
+        """What is wrong with the channel of that place, with the value if that is known."""
+        unit = f" {self.units[place]}" if self.units[place] != "1" else ""
+        shown = "" if value is None else f" {value:.6g}{unit}"
+        return (
+            f"{self.names[place]}{shown} is outside its limits {self.low[place]:g} to "
+            f"{self.high[place]:g}{unit}: the sensor or its line is at fault"
+        )
