@@ -267,8 +267,9 @@ def test_an_impossible_value_is_named_and_not_used(store: Store, monitor: Monito
     )
     assert (first["time"], last["time"]) == (BEGIN + 100 * SECOND, BEGIN + 202 * SECOND)
     assert last["text"] == "level is within its limits again"
-    with pytest.raises(InputError, match="limits"):
-        live.add("b", "tank", {"limits": {"air": [0.0, 1.0]}})
+    for wrong in ({"air": [0.0, 1.0]}, {"level": [5.0, -1.0]}):
+        with pytest.raises(InputError, match="limits"):
+            live.add("b", "tank", {"limits": wrong})
     live.add("c", "tank", {"limits": {"pump": [0.0, 10.0]}})
     impossible = np.array([[99.0, 0.5]])
     assert live.submit([samples(impossible, asset="c")])[0].counts.unknown == 1

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import one_of
+from retwin.checks import one_of, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,12 +23,14 @@ class Limits:
 
     @classmethod
     def of(cls, twin: Any, declared: Mapping[str, Sequence[float]]) -> Limits:
-        """Those that are declared for channels of a twin; InputError for another channel."""
+        """Those that are declared for channels of a twin; InputError if they are none."""
         names = (*twin.inputs.names, *twin.outputs.names)
         units = (*twin.inputs.units, *twin.outputs.units)
         low, high = np.full((2, len(names)), [[-np.inf], [np.inf]])
         for name, (least, most) in declared.items():
-            place = names.index(one_of("limits", name, names))
+            place, got = names.index(one_of("limits", name, names)), f"{least:g} and {most:g}"
+            expected, remedy = f"the smallest and then the largest value of {name}", "swap them"
+            require(least < most, "limits", expected=expected, got=got, remedy=remedy)
             low[place], high[place] = least, most
         return cls(names, units, low, high)
 
