@@ -35,10 +35,10 @@ DEMO_SIMULATED = 10
 """Healthy trajectories of each fold that the demo simulates."""
 DEMO_OVERLAID = 1
 """Faulty trajectories of each class and fold that the page of the demo shows in full."""
-DEMO_EPOCHS = 8
-"""Epochs of the demo's surrogate, whose error is then a tenth of the twin's."""
-DEMO_MINUTES = 2
-"""Minutes that a run of the demo takes on two cores, as measured."""
+DEMO_EPOCHS = 6
+"""Epochs of the demo's surrogate, whose error is then a tenth of the discrepancy."""
+DEMO_MINUTES = 3
+"""Minutes that a run of the demo takes at most on two cores, as measured."""
 COMPARED = {"a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict"}
 """What is printed of a comparison as JSON."""
 StudyFolder = Annotated[Path, option("FOLDER", "Called again, the study goes on there.")]
