@@ -69,14 +69,16 @@ def test_real_numbers_come_back_as_floats(value: Any) -> None:
 
 
 def test_bounds_include_their_ends() -> None:
-    assert finite("share", 0, least=0, most=1) == 0
-    assert finite("share", 1, least=0, most=1) == 1
+    assert finite("share", 0, at_least=0, at_most=1) == 0
+    assert finite("share", 1, at_least=0, at_most=1) == 1
     assert finite("share", -5) == -5
     for value in (-1e-9, 1 + 1e-9):
-        error = refused(finite, "share", value, least=0, most=1, unit="s", remedy="give a share")
+        error = refused(
+            finite, "share", value, at_least=0, at_most=1, unit="s", remedy="give a share"
+        )
         assert error.expected == "a finite number from 0 to 1 in s"
         assert error.remedy == "give a share"
-    assert refused(finite, "low", 2, most=1).expected == "a finite number of at most 1"
+    assert refused(finite, "low", 2, at_most=1).expected == "a finite number of at most 1"
 
 
 def test_positive_excludes_zero() -> None:
@@ -90,9 +92,11 @@ def test_positive_excludes_zero() -> None:
 
 
 def test_whole_numbers_have_bounds() -> None:
-    assert whole("folds", 2, least=2, most=2) == 2
-    assert refused(whole, "folds", 1, least=2, most=5).expected == "a whole number from 2 to 5"
-    assert refused(whole, "folds", 6, least=2, most=5).got == "6"
+    assert whole("folds", 2, at_least=2, at_most=2) == 2
+    assert (
+        refused(whole, "folds", 1, at_least=2, at_most=5).expected == "a whole number from 2 to 5"
+    )
+    assert refused(whole, "folds", 6, at_least=2, at_most=5).got == "6"
     assert refused(whole, "steps", -1).expected == "a whole number of at least 0"
     assert refused(whole, "steps", 2.0).got == "2.0"
 

@@ -62,12 +62,12 @@ def finite(
     argument: str,
     value: Any,
     *,
-    least: float = -inf,
-    most: float = inf,
+    at_least: float = -inf,
+    at_most: float = inf,
     unit: str = "",
     remedy: str = "",
 ) -> float:
-    """`value`, if it is a finite number from `least` to `most`, ends included.
+    """`value`, if it is a finite number from `at_least` to `at_most`, ends included.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def finite(
         The name of the argument in the message.
     value : number
         A Python or numpy number; a bool is none.
-    least, most : float
+    at_least, at_most : float
         The bounds.
     unit : str
         The unit that the message states.
@@ -88,12 +88,12 @@ def finite(
         It is NaN, infinite, out of range or no number.
 
     """
-    low = f"of at least {least:g}" if least > -inf else ""
-    high = f"of at most {most:g}" if most < inf else ""
-    bounds = f"from {least:g} to {most:g}" if low and high else low or high
+    low = f"of at least {at_least:g}" if at_least > -inf else ""
+    high = f"of at most {at_most:g}" if at_most < inf else ""
+    bounds = f"from {at_least:g} to {at_most:g}" if low and high else low or high
     expected = ["a finite number", bounds, unit and f"in {unit}"]
     require(
-        _real(value) and least <= value <= most,
+        _real(value) and at_least <= value <= at_most,
         argument,
         expected=" ".join(filter(None, expected)),
         got=repr(value),
@@ -124,9 +124,9 @@ def apart(one: float, other: float) -> tuple[str, str]:
 
 
 def whole(
-    argument: str, value: Any, *, least: int = 0, most: int | None = None, remedy: str = ""
+    argument: str, value: Any, *, at_least: int = 0, at_most: int | None = None, remedy: str = ""
 ) -> int:
-    """`value`, if it is a whole number from `least` to `most`, ends included.
+    """`value`, if it is a whole number from `at_least` to `at_most`, ends included.
 
     Raises
     ------
@@ -135,9 +135,9 @@ def whole(
 
     """
     number = isinstance(value, Integral) and not isinstance(value, bool)
-    span = f"of at least {least}" if most is None else f"from {least} to {most}"
+    span = f"of at least {at_least}" if at_most is None else f"from {at_least} to {at_most}"
     require(
-        number and least <= value and (most is None or value <= most),
+        number and at_least <= value and (at_most is None or value <= at_most),
         argument,
         expected=f"a whole number {span}",
         got=repr(value),
@@ -150,20 +150,20 @@ def _real(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
 
 
-def at_least(argument: str, values: Sized, least: int, what: str, *, remedy: str) -> None:
-    """Require a collection to have at least `least` members, which `what` names in the plural."""
+def at_least(argument: str, values: Sized, count: int, what: str, *, remedy: str) -> None:
+    """Require a collection to have at least `count` members, which `what` names in the plural."""
     require(
-        len(values) >= least,
+        len(values) >= count,
         argument,
-        expected=f"at least {least} {what}",
+        expected=f"at least {count} {what}",
         got=str(len(values)),
         remedy=remedy,
     )
 
 
-def at_most(argument: str, count: int, most: int, what: str, *, remedy: str) -> None:
-    """Require no more than `most` of something, which `what` names in the plural."""
-    require(count <= most, argument, expected=f"at most {most} {what}", got=count, remedy=remedy)
+def at_most(argument: str, count: int, limit: int, what: str, *, remedy: str) -> None:
+    """Require no more than `limit` of something, which `what` names in the plural."""
+    require(count <= limit, argument, expected=f"at most {limit} {what}", got=count, remedy=remedy)
 
 
 def nothing(argument: str, found: Iterable[object], expected: str, *, remedy: str) -> None:

@@ -52,4 +52,4 @@ def test_a_trajectory_with_gaps_may_be_typical_if_it_is_asked_for() -> None:
     observed[2, :8] = np.nan
     times, every = np.zeros((3, 1, 3)), np.ones(3, dtype=bool)
     assert median_error_trajectory(nominal, observed, times, every) is None
-    assert median_error_trajectory(nominal, observed, times, every, least=0.5) == 0
+    assert median_error_trajectory(nominal, observed, times, every, at_least=0.5) == 0

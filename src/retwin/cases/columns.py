@@ -56,7 +56,7 @@ class Record:
     time: TimeColumn | str | None = None
 
     def __post_init__(self) -> None:
-        finite("transient", self.transient, least=0.0, unit="s", remedy="leave it out")
+        finite("transient", self.transient, at_least=0.0, unit="s", remedy="leave it out")
         require(
             self.rows is None or 0 <= self.rows[0] < self.rows[1],
             "rows",

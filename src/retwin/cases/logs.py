@@ -68,7 +68,7 @@ class Columns:
     mapping: str | Path | None = None
 
     def __post_init__(self) -> None:
-        finite("transient", self.transient, least=0.0, unit="s", remedy="leave it out")
+        finite("transient", self.transient, at_least=0.0, unit="s", remedy="leave it out")
 
 
 @dataclass(frozen=True, eq=False)

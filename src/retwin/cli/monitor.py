@@ -268,7 +268,7 @@ def run(
     kept.
     """
     if seconds is not None:
-        finite("seconds", positive("seconds", seconds, unit="s"), most=threading.TIMEOUT_MAX)
+        finite("seconds", positive("seconds", seconds, unit="s"), at_most=threading.TIMEOUT_MAX)
     if demo:
         leave_out({"--config": None if config == CONFIG else config}, "with --demo")
         _demonstrate(8710 if port is None else port, open_page, seconds)

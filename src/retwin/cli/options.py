@@ -78,7 +78,7 @@ Seed = Annotated[
         "Same seed, same result.",
         "--seed",
         min=0,
-        callback=lambda seed: whole("--seed", seed, most=MAX_SEED),
+        callback=lambda seed: whole("--seed", seed, at_most=MAX_SEED),
     ),
 ]
 Json = Annotated[bool, option("", "Print JSON instead, and nothing else.", "--json")]

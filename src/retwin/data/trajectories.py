@@ -237,7 +237,7 @@ class Trajectories:
             `steps` is smaller than T.
 
         """
-        steps = whole("steps", steps, least=self.steps, remedy="padding makes them longer")
+        steps = whole("steps", steps, at_least=self.steps, remedy="padding makes them longer")
         longer = ((0, 0), (0, steps - self.steps), (0, 0))
         return self.replace(
             commands=np.pad(self.commands, longer, mode="edge"),
@@ -347,7 +347,7 @@ class Trajectories:
 
         """
         count = whole(
-            "folds", count, least=2, most=len(self), remedy="give fewer folds or more data"
+            "folds", count, at_least=2, at_most=len(self), remedy="give fewer folds or more data"
         )
         rng = np.random.default_rng(seed)
         fold = np.empty(len(self), dtype=int)

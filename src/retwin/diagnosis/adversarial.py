@@ -52,7 +52,7 @@ class DANN:
     gamma: float = 10.0
 
     def __post_init__(self) -> None:
-        whole("hidden", self.hidden, least=1)
+        whole("hidden", self.hidden, at_least=1)
         positive("gamma", self.gamma)
 
     def fit(self, task: TrainingTask) -> NetworkDiagnoser:

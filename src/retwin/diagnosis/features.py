@@ -96,7 +96,7 @@ class Features:
         return cls(
             Channels.of(values["outputs"]),
             sample_rate("rate", values["rate"]),
-            whole("stride", values["stride"], least=1, most=MAX_STRIDE),
+            whole("stride", values["stride"], at_least=1, at_most=MAX_STRIDE),
             values.get("hide_start", False),
         )
 

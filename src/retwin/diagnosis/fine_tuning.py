@@ -46,7 +46,7 @@ class FineTune:
     def __post_init__(self) -> None:
         remedy = "train one with fit_diagnoser on generated trajectories"
         instance("base", self.base, NetworkDiagnoser, remedy=remedy)
-        whole("generated_per_labelled", self.generated_per_labelled, least=1)
+        whole("generated_per_labelled", self.generated_per_labelled, at_least=1)
 
     def fit(self, task: TrainingTask) -> NetworkDiagnoser:
         """Train a copy of the base on both sets; see `fit_diagnoser`.

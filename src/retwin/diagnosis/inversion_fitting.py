@@ -98,7 +98,7 @@ def fit_inversion(
         `StateInversionDiagnoser` refuses.
 
     """
-    finite("false_rate", false_rate, least=0.001, most=0.5)
+    finite("false_rate", false_rate, at_least=0.001, at_most=0.5)
     if isinstance(surrogate, DynamicsTwin):
         require(
             residual is None,

@@ -69,7 +69,7 @@ class Rocket:
 
     def __post_init__(self) -> None:
         require(
-            whole("kernels", self.kernels, least=PATTERNS) % PATTERNS == 0,
+            whole("kernels", self.kernels, at_least=PATTERNS) % PATTERNS == 0,
             "kernels",
             expected=f"a multiple of {PATTERNS}",
             got=self.kernels,

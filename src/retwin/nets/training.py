@@ -66,12 +66,12 @@ class Training:
 
     def __post_init__(self) -> None:
         one_of("decay", self.decay, ("cosine", "step"))
-        whole("max_epochs", self.max_epochs, least=1)
-        whole("batch_size", self.batch_size, least=1)
+        whole("max_epochs", self.max_epochs, at_least=1)
+        whole("batch_size", self.batch_size, at_least=1)
         whole("patience", self.patience)
         positive("learning_rate", self.learning_rate)
-        finite("weight_decay", self.weight_decay, least=0)
-        finite("clip", self.clip, least=0)
+        finite("weight_decay", self.weight_decay, at_least=0)
+        finite("clip", self.clip, at_least=0)
 
 
 @dataclass(frozen=True)

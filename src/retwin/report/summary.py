@@ -177,7 +177,7 @@ def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
     nominal, observed, times, bands = (portrait[name] for name in names)
     chosen = partial(median_error_trajectory, nominal, observed, times, study.overlaid_healthy)
     # Where no healthy trajectory is complete, one of which most was measured.
-    place = chosen() if chosen() is not None else chosen(least=MOSTLY)
+    place = chosen() if chosen() is not None else chosen(at_least=MOSTLY)
     if place is None:
         return None
     outputs = study.results.outputs

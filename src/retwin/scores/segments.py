@@ -49,7 +49,7 @@ def median_error_trajectory(
     times: NDArray,
     candidates: NDArray,
     *,
-    least: float = 1.0,
+    at_least: float = 1.0,
 ) -> int | None:
     """The candidate with the median RMS error, of those that were observed completely.
 
@@ -61,7 +61,7 @@ def median_error_trajectory(
         Onset, start of the steady part and end of every segment in s; NaN for no segment.
     candidates : array (n,)
         Whether each trajectory may be chosen.
-    least : float
+    at_least : float
         The share of its values from 0 to 1 that must have been observed.
 
     Returns
@@ -73,7 +73,7 @@ def median_error_trajectory(
     seen = np.isfinite(observed)
     squares = np.where(seen, np.square(observed - nominal), 0.0).sum(axis=(1, 2))
     error = np.sqrt(squares / np.maximum(seen.sum(axis=(1, 2)), 1))
-    known = (seen.mean(axis=(1, 2)) >= least) & np.isfinite(times).any(axis=(1, 2))
+    known = (seen.mean(axis=(1, 2)) >= at_least) & np.isfinite(times).any(axis=(1, 2))
     known &= seen.any(axis=(1, 2))
     usable = np.flatnonzero(known & candidates)
     if not len(usable):

@@ -44,7 +44,7 @@ class Budget:
         self._given = limit is not None
         self._kind = "memory" if disk is None else "disk"
         if limit is not None:
-            self._limit = whole("max_bytes", limit, least=1)
+            self._limit = whole("max_bytes", limit, at_least=1)
         elif disk is None:
             self._limit = int(MEMORY_SHARE * (memory()[1] or sys.maxsize))
         else:

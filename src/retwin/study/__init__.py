@@ -86,7 +86,9 @@ def run_study(
         scheduler, or if one of its workers does not see `out`.
 
     """
-    workers = (os.cpu_count() or 1) if processes is None else whole("processes", processes, least=1)
+    workers = (
+        (os.cpu_count() or 1) if processes is None else whole("processes", processes, at_least=1)
+    )
     require(
         processes is None or scheduler is None,
         "processes",
@@ -173,8 +175,8 @@ def _check_possible(case: Case, plan: StudyPlan) -> None:
         finite(
             "rate",
             plan.rate,
-            least=2 * case.rate / case.sampler.steps,
-            most=case.rate,
+            at_least=2 * case.rate / case.sampler.steps,
+            at_most=case.rate,
             unit="Hz",
             remedy="give one between two samples per trajectory and the rate of the data",
         )

@@ -129,18 +129,18 @@ class StudyPlan:
             got=self.sources,
             remedy=f"choose from {', '.join(SOURCES)}",
         )
-        whole("runs", self.number_of_runs, least=1, most=MAX_RUNS)
+        whole("runs", self.number_of_runs, at_least=1, at_most=MAX_RUNS)
         whole("seed", self.seed)
-        whole("folds", self.folds, least=2)
+        whole("folds", self.folds, at_least=2)
         if self.per_class is not None:
-            whole("per_class", self.per_class, least=1, most=MAX_PER_CLASS)
+            whole("per_class", self.per_class, at_least=1, at_most=MAX_PER_CLASS)
         if self.rate is not None:
             sample_rate("rate", self.rate)
-        whole("emulated_healthy", self.emulated_healthy, least=1, most=MAX_PER_CLASS)
+        whole("emulated_healthy", self.emulated_healthy, at_least=1, at_most=MAX_PER_CLASS)
         for name in ("calibrated", "simulated", "overlaid"):
             if (count := getattr(self, name)) is not None:
-                whole(name, count, least=1)
-        finite("encoder_noise", self.encoder_noise, least=0.0, unit="command units")
+                whole(name, count, at_least=1)
+        finite("encoder_noise", self.encoder_noise, at_least=0.0, unit="command units")
 
     def generated(self, case: Case) -> int:
         """Generated trajectories per class; the case's by default."""

@@ -205,7 +205,7 @@ def generate(
 
     """
     remedy = "give fewer, or write a *.zarr with simulate_to"
-    whole("per_class", per_class, least=1, most=MAX_PER_CLASS, remedy=remedy)
+    whole("per_class", per_class, at_least=1, at_most=MAX_PER_CLASS, remedy=remedy)
     width = len(twin.inputs) + 2 * len(twin.outputs)
     numbers = per_class * len(case.faults) * case.sampler.steps * width
     Budget("per_class").take(BYTES_PER_NUMBER * numbers)

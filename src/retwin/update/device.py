@@ -131,7 +131,7 @@ class DeviceTwin:
         """
         sent, twin = self._send(commands), self.twin
         generator = torch.Generator(self.device).manual_seed(checked_seed(seed))
-        size = whole("chunk", chunk, least=1, remedy="leave it out")
+        size = whole("chunk", chunk, at_least=1, remedy="leave it out")
         faults = [None] * len(sent) if faults is None else faults
         check_faults(faults, len(twin.inputs), len(twin.outputs), ())
         self._check_range(sent)

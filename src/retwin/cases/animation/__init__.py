@@ -95,7 +95,7 @@ def animate(
         of another system.
 
     """
-    _check(fps, size, renderer, least=SMALL if updated is None else WITH_CHART)
+    _check(fps, size, renderer, at_least=SMALL if updated is None else WITH_CHART)
     suffix = check_film(path)
     remedy, got = "give the Case a body", f"{case.name}, which has none"
     body = given(
@@ -156,14 +156,14 @@ def _chart(one: Trajectories, drawn: NDArray) -> Chart:
     )
 
 
-def _check(fps: float, size: tuple[int, int], renderer: str, *, least: tuple[int, int]) -> None:
+def _check(fps: float, size: tuple[int, int], renderer: str, *, at_least: tuple[int, int]) -> None:
     """Refuse settings out of range."""
-    finite("fps", fps, least=1, most=100, unit="frames per second", remedy="25 is common")
+    finite("fps", fps, at_least=1, at_most=100, unit="frames per second", remedy="25 is common")
     # Video codecs halve the resolution of colour.
     require(
-        all(a <= side <= 4096 and side % 2 == 0 for a, side in zip(least, size, strict=True)),
+        all(a <= side <= 4096 and side % 2 == 0 for a, side in zip(at_least, size, strict=True)),
         "size",
-        expected=f"an even width and height from {least[0]}x{least[1]} to 4096x4096 pixels",
+        expected=f"an even width and height from {at_least[0]}x{at_least[1]} to 4096x4096 pixels",
         got=f"{size[0]}x{size[1]}",
         remedy="640x480 is common",
     )

@@ -115,10 +115,12 @@ class EmulatedArmPi(TwinWrapper):
         for each in fields(self):
             if each.name not in ("arm", "phases"):
                 most = 1.0 if each.name in PROBABILITIES else math.inf
-                finite(each.name, getattr(self, each.name), least=0.0, most=most, remedy=remedy)
+                finite(
+                    each.name, getattr(self, each.name), at_least=0.0, at_most=most, remedy=remedy
+                )
         stride_of(self.rate, self.sensor_rate, argument="sensor_rate")
         for phase in self.phases or (math.nan,):
-            finite("phases", phase, least=0.0, most=1 / self.sensor_rate, remedy=remedy)
+            finite("phases", phase, at_least=0.0, at_most=1 / self.sensor_rate, remedy=remedy)
 
     @property
     def twin(self) -> Twin:

@@ -130,7 +130,7 @@ def export_actuator(
 
     """
     twin, operator = causal_part(twin)
-    whole("draws", draws, least=1, most=MAX_DRAWS)
+    whole("draws", draws, at_least=1, at_most=MAX_DRAWS)
     seed = checked_seed(seed)
     period = 1 / twin.rate if period is None else positive("period", period, unit="s")
     files = ["model.json", "weights.safetensors", "actuator.pt", *(["actuator.onnx"] * onnx)]

@@ -161,7 +161,7 @@ def _require(right: bool, what: str, expected: str, got: str, remedy: str) -> No
 
 
 def _history(history: Sequence[int]) -> tuple[int, ...]:
-    lags = tuple(int(finite("history", each, least=0, most=MAX_HISTORY)) for each in history)
+    lags = tuple(int(finite("history", each, at_least=0, at_most=MAX_HISTORY)) for each in history)
     right = bool(lags) and len(set(lags)) == len(lags) and lags == tuple(history)
     _require(right, "history", "steps into the past, each once", str(history), "give (0, 1, 2)")
     return lags

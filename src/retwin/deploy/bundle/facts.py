@@ -52,8 +52,8 @@ class Facts:
 
     def __post_init__(self) -> None:
         remedy = "take it from the case"
-        whole("facts.steps", self.steps, least=2, remedy=remedy)
-        whole("facts.max_segments", self.max_segments, most=self.steps, remedy=remedy)
+        whole("facts.steps", self.steps, at_least=2, remedy=remedy)
+        whole("facts.max_segments", self.max_segments, at_most=self.steps, remedy=remedy)
         sample_rate("facts.sensor_rate", self.sensor_rate, remedy=remedy)
 
     @property

@@ -52,9 +52,11 @@ class Sensor:
     @classmethod
     def of(cls, about: Mapping[str, Any], steps: int) -> Sensor:
         """The settings from JSON values, for trajectories of so many samples."""
-        every = whole("sensor.every", about["every"], least=1, most=steps)
+        every = whole("sensor.every", about["every"], at_least=1, at_most=steps)
         phases = about["phases"] or range(every)
-        return cls(every, tuple(whole("sensor.phases", phase, most=every - 1) for phase in phases))
+        return cls(
+            every, tuple(whole("sensor.phases", phase, at_most=every - 1) for phase in phases)
+        )
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,8 @@ class Classifier:
         settled = about["settled"]
         return cls(
             tuple(str(name) for name in about["classes"]),
-            whole("diagnoser.stride", about["stride"], least=1, most=steps),
-            None if settled is None else whole("diagnoser.settled", settled, most=steps),
+            whole("diagnoser.stride", about["stride"], at_least=1, at_most=steps),
+            None if settled is None else whole("diagnoser.settled", settled, at_most=steps),
         )
 
 
@@ -178,7 +180,7 @@ class Portable:
                 outputs=Channels.of(about["outputs"]),
                 rate=sample_rate("rate", about["rate"]),
                 domain=Domain.of(about["domain"]),
-                stride=whole("stride", about["stride"], least=1, most=facts.steps),
+                stride=whole("stride", about["stride"], at_least=1, at_most=facts.steps),
                 sensor=sensor,
                 diagnoser=classifier,
                 emulated=bool(about["emulated"]),

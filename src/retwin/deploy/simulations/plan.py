@@ -120,8 +120,10 @@ class SimulationPlan:
             object.__setattr__(self, "commands", Recorded(array.astype(self.dtype, copy=False)))
         if self.n is None and isinstance(self.commands, Recorded):
             object.__setattr__(self, "n", len(self.commands.array))
-        whole("n", self.n, least=1, remedy="give the number of trajectories that are to be drawn")
-        whole("chunk", self.chunk, least=1, most=MAX_CHUNK)
+        whole(
+            "n", self.n, at_least=1, remedy="give the number of trajectories that are to be drawn"
+        )
+        whole("chunk", self.chunk, at_least=1, at_most=MAX_CHUNK)
         whole("seed", self.seed)
         remedy = f"give {{'{HEALTHY}': None}} for healthy trajectories only"
         at_least("faults", self.faults, 1, "class", remedy=remedy)

@@ -170,7 +170,7 @@ def score_model(
         or nothing left to score.
 
     """
-    skipped = round(finite("warm_up", warm_up, least=0.0) * records.rate)
+    skipped = round(finite("warm_up", warm_up, at_least=0.0) * records.rate)
     found = predict_records(model, records, horizon=horizon, seed=seed)
     seen = records.mask & np.isfinite(found.mean)
     seen[:, :skipped] = False

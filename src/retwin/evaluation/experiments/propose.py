@@ -175,7 +175,7 @@ def next_experiments(
     """
     show = progress or (lambda _: None)
     _check(twin, sampler, count, candidates)
-    finite("tolerance", tolerance, least=1e-6, most=10)
+    finite("tolerance", tolerance, at_least=1e-6, at_most=10)
     rng = np.random.default_rng(checked_seed(seed))
     healthy = calibration[calibration.maybe_healthy]
     remedy = "record any healthy ones first"
@@ -212,8 +212,8 @@ def next_experiments(
 
 
 def _check(twin: object, sampler: CommandSampler, count: int, candidates: int) -> None:
-    whole("count", count, least=1, most=FURTHER)
-    whole("candidates", candidates, least=count, most=100_000)
+    whole("count", count, at_least=1, at_most=FURTHER)
+    whole("candidates", candidates, at_least=count, at_most=100_000)
     if not isinstance(twin, DynamicsTwin):
         instance("twin", twin, CorrectedTwin, remedy="give a corrected twin with one z per segment")
         assert isinstance(twin, CorrectedTwin)

@@ -195,7 +195,7 @@ def _check(twin: Twin, trajectories: Trajectories, rate: float | None, draws: in
         got="one that was never measured",
         remedy="leave it out",
     )
-    whole("draws", draws, least=INFERRED, remedy="take the default of 200")
+    whole("draws", draws, at_least=INFERRED, remedy="take the default of 200")
     return stride
 
 

@@ -103,7 +103,7 @@ class Detector:
 
     def start(self, streams: int) -> DetectorState:
         """The state before the first sample, and after a reset."""
-        count = whole("streams", streams, least=1)
+        count = whole("streams", streams, at_least=1)
         require(
             len(self.which) in (1, count),
             "streams",

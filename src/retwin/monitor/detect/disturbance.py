@@ -150,7 +150,7 @@ def fit_disturbance(
         With the held-out errors of the calibration.
 
     """
-    whole("max_order", max_order, least=1, most=6)
+    whole("max_order", max_order, at_least=1, at_most=6)
     given = np.asarray(residual, dtype=float)
     given = np.where(np.abs(given) < 1e100, given, np.nan)
     seen = ~np.isnan(given)
@@ -170,7 +170,7 @@ def fit_disturbance(
         remedy="leave out a channel that does not move",
     )
     if isinstance(folds, int):
-        folds = np.array_split(np.arange(given.shape[1]), whole("folds", folds, least=2))
+        folds = np.array_split(np.arange(given.shape[1]), whole("folds", folds, at_least=2))
     fewest = min((seen.sum(axis=1) - seen[:, each].sum(axis=1)).min() for each in folds)
     enough = MIN_RESIDUALS // 2
     require(

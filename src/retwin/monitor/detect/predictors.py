@@ -59,7 +59,7 @@ class Predictor:
 
     def __post_init__(self) -> None:
         for name in ("process", "warm_up", "effect"):
-            finite(name, getattr(self, name), least=0.0)
+            finite(name, getattr(self, name), at_least=0.0)
 
     def filter(self, twin: DynamicsTwin) -> OnlineFilter:
         """Its filter."""

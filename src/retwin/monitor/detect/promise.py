@@ -86,8 +86,8 @@ def false_alarms(wanted: str | float, rate: float) -> float:
     return finite(
         "false_alarms",
         samples,
-        least=MIN_RUN_LENGTH,
-        most=MAX_RUN_LENGTH,
+        at_least=MIN_RUN_LENGTH,
+        at_most=MAX_RUN_LENGTH,
         unit="samples from one false alarm to the next, on average",
         remedy=f"{remedy}; a bare number counts samples",
     )
@@ -117,7 +117,7 @@ class FalseAlarmTest:
 
     def __post_init__(self) -> None:
         whole("alarms", self.alarms)
-        whole("samples", self.samples, least=1)
+        whole("samples", self.samples, at_least=1)
         positive("run_length", self.run_length, unit=self.unit)
 
     @property

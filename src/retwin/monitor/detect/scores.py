@@ -108,7 +108,7 @@ class ConformalScores:
         errors = np.empty(len(arrays["error"]), dtype=complex)
         errors.real, errors.imag = arrays["stream"], arrays["error"]
         quantiles, independent = arrays["quantiles"], arrays["independent"]
-        ranks = len(errors) + len(independent) * (whole("copies", copies, least=1) + 1)
+        ranks = len(errors) + len(independent) * (whole("copies", copies, at_least=1) + 1)
         check_weights(len(quantiles) == ranks, f"{ranks} quantiles, one per rank", len(quantiles))
         return cls(errors, quantiles, copies, independent)
 

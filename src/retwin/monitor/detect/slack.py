@@ -43,8 +43,8 @@ class Slack:
     shift: float = 0.0
 
     def __post_init__(self) -> None:
-        finite("kappa", self.kappa, least=1, most=10)
-        finite("shift", self.shift, least=0, most=3, unit="standard deviations")
+        finite("kappa", self.kappa, at_least=1, at_most=10)
+        finite("shift", self.shift, at_least=0, at_most=3, unit="standard deviations")
 
     def __str__(self) -> str:
         return (
@@ -108,7 +108,7 @@ class Slack:
             "one, the twin does not follow that machine: fit it to the machine first",
         )
         count = float(samples)
-        finite("confidence", confidence, least=0.5, most=0.9999)
+        finite("confidence", confidence, at_least=0.5, at_most=0.9999)
         variance = (np.pi / 2 + whole("parameters", parameters)) / count
         shift = ndtri((1 + confidence) / 2) * np.sqrt(variance)
         ranks = np.unique(np.geomspace(1, (count + 1) / 2, 200))

@@ -93,8 +93,8 @@ class Validity:
     def __post_init__(self) -> None:
         instance("detector", self.detector, Detector, remedy="use the detector that alarms")
         positive("arl", self.arl, unit="samples")
-        finite("alpha", self.alpha, least=1e-12, most=0.5)
-        whole("block", self.block, least=1)
+        finite("alpha", self.alpha, at_least=1e-12, at_most=0.5)
+        whole("block", self.block, at_least=1)
 
     def start(self, streams: int) -> ValidityState:
         """The state before the first sample, and after a new calibration."""

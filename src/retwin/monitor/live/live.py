@@ -74,9 +74,9 @@ class Live:
     ) -> None:
         self.store = instance("store", store, Store, remedy="open one with Store(folder)")
         if wait is not None:
-            finite("wait", wait, least=0.0, most=MAX_WAIT, unit="s")
+            finite("wait", wait, at_least=0.0, at_most=MAX_WAIT, unit="s")
         self._wait = wait
-        self._ahead = finite("ahead", ahead, least=0.0, most=LATEST / SECOND, unit="s")
+        self._ahead = finite("ahead", ahead, at_least=0.0, at_most=LATEST / SECOND, unit="s")
         self._clock = clock
         self._lock = threading.RLock()
         self._diagnosing = threading.Lock()
@@ -230,7 +230,7 @@ class Live:
         """
         remedy = "give a name, which the log keeps"
         require(who.strip(), "who", expected="who has seen it", got=repr(who), remedy=remedy)
-        after = whole("sequence", sequence, least=0) - 1
+        after = whole("sequence", sequence, at_least=0) - 1
         entry = next(iter(self.store.log("alarm", after=after)), None)
         require(
             entry is not None and entry.sequence == sequence,

@@ -202,7 +202,7 @@ def find_causes(
         Faults that cannot be inverted (`fit_inversion`), or an alarm of another record.
 
     """
-    whole("before", before, least=MIN_WINDOW)
+    whole("before", before, at_least=MIN_WINDOW)
     ids, found, known = record.ids.tolist(), [], dict[str, list[Alarm]]()
     current = dict[tuple[str, int], str]()
     for alarm in alarms:

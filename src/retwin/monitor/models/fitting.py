@@ -92,7 +92,7 @@ def fit_monitor(
     check_magnitude("healthy", healthy)
     arl = false_alarms(false_alarms_at_most, twin.rate)
     positive("lasting", lasting, unit="s")
-    finite("alpha", alpha, least=1e-12, most=0.5)
+    finite("alpha", alpha, at_least=1e-12, at_most=0.5)
     for note in summarise(check_records(healthy).findings):
         warnings.warn(f"healthy: {note}", stacklevel=2)
     measured = np.where(healthy.mask, healthy.observed, np.nan).astype(float)

@@ -84,5 +84,5 @@ def read_fields(folder: str | Path) -> dict[str, Any]:
             "tried": Tried(**about["tried"]),
             "predictors": predictors,
             "visible": tuple(Visible(**each) for each in about["visible"]),
-            **{name: finite(name, about[name], least=0.0) for name in NUMBERS},
+            **{name: finite(name, about[name], at_least=0.0) for name in NUMBERS},
         }

@@ -292,14 +292,14 @@ class TrajectoryMonitor:
                 diagnoser,
                 scores,
                 Slack(*about["slack"]),
-                finite("kappa", about["kappa"], least=1.0),
-                finite("arl", about["arl"], least=MIN_RUN_LENGTH, most=MAX_RUN_LENGTH),
+                finite("kappa", about["kappa"], at_least=1.0),
+                finite("arl", about["arl"], at_least=MIN_RUN_LENGTH, at_most=MAX_RUN_LENGTH),
                 positive("duration", about["duration"], unit="s"),
                 measured,
                 OffsetModel.of_arrays(arrays, len(twin.inputs)),
-                finite("alpha", about["alpha"], least=1e-12, most=0.5),
-                whole("used", about["used"], least=0),
-                whole("given", about["given"], least=0),
+                finite("alpha", about["alpha"], at_least=1e-12, at_most=0.5),
+                whole("used", about["used"], at_least=0),
+                whole("given", about["given"], at_least=0),
             )
 
 

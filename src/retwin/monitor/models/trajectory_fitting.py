@@ -71,7 +71,7 @@ def fit_trajectory_monitor(
     """
     diagnoser = checked(checked(diagnoser).with_faults(causes or {}))
     instance("healthy", healthy, Trajectories, remedy="load recorded ones")
-    finite("alpha", alpha, least=1e-12, most=0.5)
+    finite("alpha", alpha, at_least=1e-12, at_most=0.5)
     _check_labels(diagnoser, healthy)
     length = healthy.steps / healthy.rate
     arl = false_alarms(false_alarms_at_most, 1 / length)

@@ -91,7 +91,7 @@ class Store:
         read_only: bool = False,
     ) -> None:
         if max_samples is not None:
-            whole("max_samples", max_samples, least=1)
+            whole("max_samples", max_samples, at_least=1)
         self.folder = Path(folder)
         self.read_only = read_only
         self._max_samples = max_samples
@@ -142,9 +142,9 @@ class Store:
             remedy="rename the asset",
         )
         if asset.version is not None:
-            whole("version", asset.version, most=2**31 - 1)
+            whole("version", asset.version, at_most=2**31 - 1)
         row = {
-            "channels": whole("channels", asset.channels, least=1, most=10_000),
+            "channels": whole("channels", asset.channels, at_least=1, at_most=10_000),
             "settings": canonical(asset.settings),
             "version": asset.version,
         }
@@ -240,7 +240,7 @@ class Store:
         """
         key, channels = self._asset(asset)
         if after is not None:
-            whole("after", after, least=EARLIEST, most=LATEST)
+            whole("after", after, at_least=EARLIEST, at_most=LATEST)
         chosen = samples.select().where(samples.c.asset == key)
         for rows in self._parts(chosen, samples.c.time, after):
             times = np.array([row.time for row in rows], dtype=np.int64)

@@ -130,7 +130,7 @@ def pack(update: Update, known: Mapping[str, tuple[int, int]]) -> Packed:
     if update.state is None:
         return Packed(update.asset, key, stamps, rows, None)
     time = update.time if update.time is not None else max(stamps.tolist(), default=None)
-    whole(f"time of the state of {update.asset}", time, least=EARLIEST, most=LATEST)
+    whole(f"time of the state of {update.asset}", time, at_least=EARLIEST, at_most=LATEST)
     return Packed(update.asset, key, stamps, rows, (key, time, blob))
 
 

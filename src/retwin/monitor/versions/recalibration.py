@@ -58,7 +58,7 @@ def recalibrate(store: Store, asset: str, *, hours: float = 24.0, new_normal: st
     stored = load_monitor(registry.folder(active.number))
     monitor = instance("monitor", stored, Monitor, remedy="calibrate it by retwin monitor fit")
     state = given("samples", store.state(asset), "stored samples", remedy="watch it first")
-    newest, span = state[0], finite("hours", hours, least=0.01, most=1e5, unit="h")
+    newest, span = state[0], finite("hours", hours, at_least=0.01, at_most=1e5, unit="h")
     begun, quiet = _events(store, asset, new_normal)
     first = max(newest - round(span * 3600 * SECOND), begun)
     times, rows = gridded(store, asset, monitor.twin, first, newest)

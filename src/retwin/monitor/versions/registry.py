@@ -232,7 +232,7 @@ class Registry:
 
     def _version(self, number: int) -> Version:
         versions = self._read()[0]
-        found = versions.get(whole("version", number, least=1))
+        found = versions.get(whole("version", number, at_least=1))
         known = f"one of {', '.join(map(str, versions)) or 'none'}"
         return given("version", found, known, got=number, remedy="propose it first")
 

@@ -102,7 +102,7 @@ class RampSampler(Timed):
         )
         self.check_steps()
         remedy = "give the number of levels that a trajectory goes to, a sample or more each"
-        whole("segments", self.segments, least=1, most=self.steps, remedy=remedy)
+        whole("segments", self.segments, at_least=1, at_most=self.steps, remedy=remedy)
         longest = self.steps // self.segments
         require(
             np.isfinite(self.ramp_durations).all()

@@ -140,7 +140,7 @@ class StateTwin:
             remedy="the start of a state is the parameter start_NAME; rename the other",
         )
         sample_rate("rate", self.rate)
-        whole("substeps", self.substeps, least=1, most=MAX_SUBSTEPS)
+        whole("substeps", self.substeps, at_least=1, at_most=MAX_SUBSTEPS)
         if self.interpolation is not None:
             one_of("interpolation", self.interpolation, INTERPOLATIONS)
         require(
@@ -333,7 +333,7 @@ class StateTwin:
         columns = zip(self.names, starts, strict=True)
         made = np.stack([own.get(name, np.full(count, start)) for name, start in columns], 1)
         for _, place in self.delay_places:
-            finite(self.names[place], float(made[:, place].min(initial=0.0)), least=0.0)
+            finite(self.names[place], float(made[:, place].min(initial=0.0)), at_least=0.0)
         return made
 
     def changes(self, faults: Sequence[Fault | None], steps: int) -> NDArray:

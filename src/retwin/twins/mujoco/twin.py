@@ -106,7 +106,7 @@ class MuJoCoTwin:
         sample_rate("rate", self.rate)
         if self.step is not None:
             positive("step", self.step, unit="s")
-        finite("settle", self.settle, least=0.0, unit="s", remedy="leave it out")
+        finite("settle", self.settle, at_least=0.0, unit="s", remedy="leave it out")
         whole("threads", self.threads, remedy="leave it out to use all cores")
 
     @classmethod

@@ -68,8 +68,6 @@ class Estimation:
     absorbed : callable, optional
         From the shared coordinates (k,) to further errors (r,) of variance 1 and their derivatives
         (r, k), see `CorrectedEquations.absorbed`.
-    free_starts : bool, default True
-        Whether unknown starts are estimated; otherwise they stay where the search begins.
 
     """
 
@@ -79,7 +77,6 @@ class Estimation:
     seen: NDArray
     variance: NDArray
     absorbed: Callable[[NDArray], tuple[NDArray, NDArray]] | None = None
-    free_starts: bool = True
 
     @cached_property
     def commands(self) -> NDArray:
@@ -244,8 +241,6 @@ class Estimation:
             value += 0.5 * float(np.sum(self.absorbed(at.point.shared)[0] ** 2))
         gradient = self._gradient(at)
         held = self._pressed(flat, gradient)
-        if not self.free_starts:
-            held[self.unknowns.count :] = True
         gradient[held] = 0.0
         return value, gradient, self._curvature(at).scaled(1.0 - held).plus(1.0 * held)
 

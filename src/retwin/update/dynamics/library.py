@@ -60,7 +60,7 @@ class Library:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", floats(self.knots))
-        whole("degree", self.degree, least=0)
+        whole("degree", self.degree, at_least=0)
         one_of("friction", self.friction, (True, False))
         require(
             all(0 <= knot <= 1 for knot in self.knots),

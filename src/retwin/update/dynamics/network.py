@@ -40,8 +40,8 @@ class TanhNetwork:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        whole("hidden", self.hidden, least=1)
-        whole("seed", self.seed, least=0)
+        whole("hidden", self.hidden, at_least=1)
+        whole("seed", self.seed, at_least=0)
 
     def terms(
         self,

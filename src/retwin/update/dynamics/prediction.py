@@ -70,7 +70,7 @@ class Prediction:
 
         NaN for an output of which no sample is measured.
         """
-        finite("share", share, least=0.0, most=1.0)
+        finite("share", share, at_least=0.0, at_most=1.0)
         inside = np.abs(self.standardised()) <= ndtri((1 + share) / 2)
         counted: NDArray = self.record.mask.sum(axis=(0, 1))
         held = (inside & self.record.mask).sum(axis=(0, 1))

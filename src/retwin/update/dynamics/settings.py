@@ -80,7 +80,7 @@ class Dynamics:
                 remedy="give each once, in a tuple",
             )
             object.__setattr__(self, name, tuple(given))
-        whole("folds", self.folds, least=2)
+        whole("folds", self.folds, at_least=2)
         one_of("memory", self.memory, (True, False))
         one_of("held", self.held, (True, False))
         for state, variables in self.depends.items():

@@ -52,7 +52,7 @@ class MCMC:
 
     def __post_init__(self) -> None:
         for name in ("walkers", "steps", "warm_up", "starts"):
-            whole(name, getattr(self, name), least=1)
+            whole(name, getattr(self, name), at_least=1)
 
     def sample(
         self, problem: BoxProblem, *, seed: int, progress: Progress | None
@@ -60,7 +60,7 @@ class MCMC:
         """Points (s, k + q), figures, and a warning, or "" where there is none."""
         emcee = needs_extra("emcee", "bayes", "samples posteriors")
         remedy = "give twice as many as parameters and scales, or free fewer parameters"
-        whole("walkers", self.walkers, least=2 * problem.size, remedy=remedy)
+        whole("walkers", self.walkers, at_least=2 * problem.size, remedy=remedy)
         rng = np.random.default_rng(seed)
         sampler = emcee.EnsembleSampler(
             self.walkers,

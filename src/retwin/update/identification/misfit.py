@@ -178,7 +178,7 @@ def misfit_of(
     Raises InputError if twin and data do not fit each other.
     """
     checked_seed(seed)
-    whole("processes", processes, least=1)
+    whole("processes", processes, at_least=1)
     stride = _check_data(twin, observed, rate)
     windows = None
     if state_based(twin):

@@ -81,15 +81,15 @@ class NPE:
     tail: float = 1e-3
 
     def __post_init__(self) -> None:
-        whole("simulations", self.simulations, least=50)
-        whole("rounds", self.rounds, least=1)
-        whole("samples", self.samples, least=100)
+        whole("simulations", self.simulations, at_least=50)
+        whole("rounds", self.rounds, at_least=1)
+        whole("samples", self.samples, at_least=100)
         for name in ("max_epochs", "hidden", "components", "batch_size"):
-            whole(name, getattr(self, name), least=1)
+            whole(name, getattr(self, name), at_least=1)
         positive("learning_rate", self.learning_rate)
         positive("clip", self.clip)
-        finite("margin", self.margin, least=0.0)
-        finite("tail", self.tail, least=0.0, most=0.49)
+        finite("margin", self.margin, at_least=0.0)
+        finite("tail", self.tail, at_least=0.0, at_most=0.49)
 
     def sample(
         self, problem: BoxProblem, *, seed: int, progress: Progress | None

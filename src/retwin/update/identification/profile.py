@@ -98,7 +98,7 @@ def profile(
     """
     names = updated.twin.names
     one_of("name", name, names)
-    whole("points", points, least=3)
+    whole("points", points, at_least=3)
     which, observed = names.index(name), measured_only(observed)
     local = updated.identifiability
     error, limit = local.errors[which], stats.t.ppf(0.975, local.freedom[which]) ** 2

@@ -60,8 +60,8 @@ class LeastSquares:
     evaluations: int = 60
 
     def __post_init__(self) -> None:
-        whole("starts", self.starts, least=1)
-        whole("evaluations", self.evaluations, least=1)
+        whole("starts", self.starts, at_least=1)
+        whole("evaluations", self.evaluations, at_least=1)
         one_of("loss", self.loss, get_args(Loss))
 
 
@@ -90,8 +90,8 @@ class Evolution:
     loss: Loss = "soft_l1"
 
     def __post_init__(self) -> None:
-        whole("population", self.population, least=1)
-        whole("generations", self.generations, least=1)
+        whole("population", self.population, at_least=1)
+        whole("generations", self.generations, at_least=1)
         one_of("loss", self.loss, get_args(Loss))
 
 

@@ -180,7 +180,7 @@ class Residual(nn.Module, ABC, Generic[D]):
         )
         model.load_state_dict(weights)
         model.degrees = [
-            math.inf if each is None else finite("degrees", each, least=1)
+            math.inf if each is None else finite("degrees", each, at_least=1)
             for each, _ in zip(about["degrees"], model.sizes, strict=True)
         ]
         model.emulated = about["emulated"]

@@ -32,7 +32,7 @@ class Refinement:
     )
 
     def __post_init__(self) -> None:
-        whole("draws", self.draws, least=2)
+        whole("draws", self.draws, at_least=2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +97,7 @@ class Mixture(Density):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        whole("components", self.components, least=1)
+        whole("components", self.components, at_least=1)
 
     def head(self, features: int, width: int) -> MixtureHead:
         """The last layer of a mixture density network."""
@@ -122,8 +122,8 @@ class Flow(Density):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        whole("transforms", self.transforms, least=1)
-        whole("bins", self.bins, least=2)
+        whole("transforms", self.transforms, at_least=1)
+        whole("bins", self.bins, at_least=2)
 
     def head(self, features: int, width: int) -> FlowHead:
         """The last layer of a network that predicts a neural spline flow."""

@@ -82,15 +82,15 @@ class StateSurrogate:
 
     def __post_init__(self) -> None:
         given = (self.states,) if isinstance(self.states, int) else tuple(self.states)
-        orders = tuple(sorted({whole("states", each, least=1) for each in given}))
+        orders = tuple(sorted({whole("states", each, at_least=1) for each in given}))
         object.__setattr__(self, "states", orders)
-        whole("hidden", self.hidden, least=1)
-        whole("simulations", self.simulations, least=MIN_SIMULATIONS)
+        whole("hidden", self.hidden, at_least=1)
+        whole("simulations", self.simulations, at_least=MIN_SIMULATIONS)
         positive("spread", self.spread)
-        finite("spread", self.spread, most=1.0)
+        finite("spread", self.spread, at_most=1.0)
         positive("accuracy", self.accuracy)
         positive("allowed", self.allowed)
-        finite("sufficient", self.sufficient, least=0.0, most=SMALL)
+        finite("sufficient", self.sufficient, at_least=0.0, at_most=SMALL)
 
 
 @dataclass(frozen=True, eq=False)
