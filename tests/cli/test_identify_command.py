@@ -212,6 +212,7 @@ def test_the_same_seed_gives_the_same_bytes(place: Path, call) -> None:
     assert Path("one/updated.toml").read_bytes() == Path("two/updated.toml").read_bytes()
 
 
+@pytest.mark.slow
 def test_what_the_logs_do_not_determine_is_said(place: Path, call) -> None:
     """`spare` changes nothing."""
     channels = ("--inputs", "valve", "--outputs", "level", "--rate", "1")

@@ -101,6 +101,7 @@ def test_tables_calibrate_without_a_model(call, tmp_path: Path) -> None:
     assert (event["output"], 150 <= event["time"] < 160) == ("pressure", True)
 
 
+@pytest.mark.slow
 def test_a_black_box_keeps_the_case_that_its_records_are_read_by(
     watched: Path, call, tmp_path: Path
 ) -> None:

@@ -370,6 +370,7 @@ def test_the_earliest_and_the_latest_time_are_restarted_from(store: Store) -> No
     assert (again[0].counts.used, again[0].counts.repeated) == (1, 1)
 
 
+@pytest.mark.slow
 def test_samples_with_many_holes_are_taken_in_parts(store: Store, monitor: Monitor) -> None:
     asset = Asset("a", 2, {"twin": "tank"}, 1)
     machine, counts = StreamMachine(asset, monitor, Layout(monitor), None), Counts()

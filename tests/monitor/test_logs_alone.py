@@ -64,6 +64,7 @@ def test_what_is_seen_is_saved_and_true(monitor: Monitor, tmp_path: Path) -> Non
     assert "from" in str(offset)
 
 
+@pytest.mark.slow
 def test_causes_of_a_case_are_not_those_of_a_black_box() -> None:
     monitor = fit_monitor(None, sensors(0, 600), "1 per day")
     name = monitor.twin.equations.parameters[0].name

@@ -110,6 +110,7 @@ def test_however_samples_are_cut_the_results_are_the_same_bytes(monitor: Monitor
     assert cut(monitor, whole, list(range(1, 600))) == wanted
 
 
+@pytest.mark.slow
 def test_a_machine_is_watched_the_same_beside_others(monitor: Monitor) -> None:
     whole = leaking()
     for both in zip(
@@ -153,6 +154,7 @@ def test_an_event_that_does_not_end_is_a_change_and_new_faults_alarm(monitor: Mo
     assert late[0] < 103.0
 
 
+@pytest.mark.slow
 def test_the_state_is_arrays_that_are_joined_and_divided(monitor: Monitor) -> None:
     whole = leaking()
     measured = np.where(whole.mask, whole.observed, np.nan)
@@ -233,6 +235,7 @@ def test_hostile_outputs_leave_the_monitor_usable(monitor: Monitor, value: float
     assert np.isfinite(found.score[0, 500:]).all()
 
 
+@pytest.mark.slow
 def test_a_saved_monitor_is_the_same(monitor: Monitor, tmp_path) -> None:
     monitor.save(tmp_path / "monitor")
     again = Monitor.load(tmp_path / "monitor")

@@ -66,6 +66,7 @@ def test_too_short_a_quiet_time_is_refused(tmp_path: Path, folder: Path) -> None
             recalibrate(store, "b")
 
 
+@pytest.mark.slow
 def test_two_parts_that_can_be_compared_are_enough(tmp_path: Path, folder: Path) -> None:
     for samples, enough in ((319, False), (320, True)):
         record = recorded(5, steps=340)[:].between(0.0, float(samples))

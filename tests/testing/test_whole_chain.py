@@ -337,6 +337,7 @@ def test_a_record_gives_the_same_beside_a_longer_one() -> None:
     torch.testing.assert_close(beside.z[: len(record)], alone.z, atol=1e-6, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["delay and offset", "per sample"])
 def test_fidelity_of_unequal_records(name: str) -> None:
     """It is finite where samples are missing and records end early."""

@@ -282,6 +282,7 @@ def test_an_fmu_without_a_reset_is_instantiated_anew(
     assert kinds.count("i") == kinds.count("r") > 600
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reset", "warning"),
     [(2, "every run has a new instance"), (3, "every run has a process of its own"), (4, "")],

@@ -16,6 +16,8 @@ from retwin.deploy.bundle.guard import Guard, fit_guard, implausible
 from retwin.deploy.bundle.verdicts import CHECKS, Domain, Prediction, Verdicts
 from retwin.nets.training import Training
 
+pytestmark = pytest.mark.slow
+
 RNG = np.random.default_rng(0)
 RANGES = Domain((0.0,), (100.0,), (5.0,), (-1.0,), (1.0,), (0.5,), mismatch=0.1, energy=2.0)
 

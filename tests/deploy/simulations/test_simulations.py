@@ -268,6 +268,7 @@ def test_a_worker_process_that_dies_is_replaced(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_warnings_of_workers_are_warnings_of_the_caller(
     workers: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -377,6 +378,7 @@ def test_failed_trajectories_are_recorded_and_left_out(tmp_path: Path) -> None:
     assert every.ids.tolist() == sound.ids[kept].tolist()
 
 
+@pytest.mark.slow
 def test_when_everything_fails_at_once_it_ends(tmp_path: Path) -> None:
     for name in ("a.zarr", "a.npz"):
         with pytest.raises(SimulationError, match="8 of 8 simulations failed: trajectory 0: ends"):
@@ -414,6 +416,7 @@ class Short(Toy):
         return super().simulate(commands, **options)[1:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", ["observed/c/3/0/0", "labels/c/3"])
 def test_a_damaged_chunk_is_seen_when_it_is_read(tmp_path: Path, chunk: str) -> None:
     folder = tmp_path / "a.zarr"
@@ -548,6 +551,7 @@ def given(count: int) -> NDArray:
     return np.repeat(np.arange(count, dtype=float), 60).reshape(count, 30, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_bad_input_is_counted_in_the_whole_set_and_leaves_nothing(
     tmp_path: Path, workers: int
@@ -590,6 +594,7 @@ class Leaking(Toy):
         return super().simulate(commands, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("workers", "kind"), [(1, Leak), (2, RuntimeError)])
 def test_what_a_twin_raises_tells_where(
     tmp_path: Path, workers: int, kind: type[Exception]

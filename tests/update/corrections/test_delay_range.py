@@ -136,6 +136,7 @@ def recorded(rate: float, delay: float) -> tuple[rt.Trajectories, Linear]:
 SHORT = rt.Mixture(components=1, hidden=(4,), training=rt.Training(max_epochs=2, batch_size=32))
 
 
+@pytest.mark.slow
 def test_a_residual_model_holds_the_range_and_says_where_it_ends() -> None:
     record, twin = recorded(500.0, 0.12)
     rg = rt.fit_residual(twin, record, rt.DelayOffset(), SHORT, seed=0)
