@@ -508,7 +508,7 @@ def test_what_cannot_be_inverted_is_refused(
     known = {"Healthy": None, "known": rt.ActuatorBias(0, bias=(20.0,) * 5)}
     with pytest.raises(rt.InputError, match="ActuatorBias with its bias open"):
         InversionDiagnoser(*parts, known, noise=inversion.noise)
-    with pytest.raises(rt.InputError, match="at least two classes"):
+    with pytest.raises(rt.InputError, match="at least 2 classes"):
         InversionDiagnoser(*parts, {"Healthy": None}, noise=inversion.noise)
     with pytest.raises(rt.InputError, match="the actuators' effective commands"):
         InversionDiagnoser(parts[0], rg, inversion.faults, noise=inversion.noise)
