@@ -160,8 +160,8 @@ class Missing(ResultsPart):
     """The one thing that a use lacks.
 
     `what` is "healthy" or "faulty" (runs), "test" (runs of any class), "records", "runs" (of
-    training), "faults", "classifier", "correction", "source" or "real"; `count` is how many more,
-    of "runs" how many in all, and None where it is not known.
+    training), "faults", "updated" (a twin), "correction", "source" or "real"; `count` is how many
+    more, of "runs" how many in all, and None where it is not known.
     """
 
     what: str

@@ -65,6 +65,14 @@ def test_few_healthy_runs_are_said_to_be_too_few(study: Study, write: Write) -> 
     assert rows["Monitor"].answer == "cannot say"
     assert rows["Monitor"].missing == "62 more healthy runs"
     assert "10 healthy runs cannot decide 5 %" in rows["Monitor"].reached
+    assert "called faulty: 3 of 10; original twin 8." in rows["Diagnose"].reached
+
+
+def test_a_study_without_an_updated_twin_lacks_one(study: Study, write: Write) -> None:
+    results, arrays = study
+    results["portrait"] = None
+    use = read_study(write((results, arrays))).results.uses[0]
+    assert (use.answer, use.missing and use.missing.what) == ("cannot say", "updated")
 
 
 def test_a_study_without_classes_says_nothing_of_faults(write: Write) -> None:

@@ -47,11 +47,13 @@ def use_rows(results: Results) -> list[UseRow]:
     ]
 
 
-def _share(it: Figure, runs: str) -> str:
-    """A share with its interval; counts where so few runs decide nothing."""
+def _share(it: Figure) -> str:
+    """A share with its interval, the original twin's beside; counts of runs that decide nothing."""
     if it.ends is None or it.ends[1] - it.ends[0] > WIDEST:
-        return f"{round(it.value * it.n)} of {it.n}"
-    return f"{percent(it.value)} ({percents(it.ends)})"
+        share, plain = f"{round(it.value * it.n)} of {it.n}", f"{it.plain * it.n:.0f}"
+    else:
+        share, plain = f"{percent(it.value)} ({percents(it.ends)})", percent(it.plain)
+    return f"{share}; original twin {plain}" if it.plain == it.plain else share
 
 
 WIDEST = 0.3
@@ -78,20 +80,14 @@ def _reached(use: Use) -> str:
         texts.append(
             f"90 % bands contain {percent(band.value)} ({percents(band.ends)}) of samples."
         )
-    for key, what, runs in (
-        ("called", "Healthy runs called faulty", "healthy run"),
-        ("found", "Faulty runs found", "faulty run"),
-        ("named", "Faults named", "faulty run"),
+    for key, what in (
+        ("called", "Healthy runs called faulty"),
+        ("found", "Faulty runs found"),
+        ("named", "Faults named"),
+        ("detected", f"With at most {percent(RATE)} false alarms, for certain, faulty runs found"),
     ):
         if key in found and not (key == "named" and use.use == "training"):
-            it = found[key]
-            texts.append(f"{what}: {_share(it, runs)}; original twin {percent(it.plain)}.")
-    if "detected" in found:
-        it = found["detected"]
-        texts.append(
-            f"With at most {percent(RATE)} false alarms, for certain, faulty runs found: "
-            f"{_share(it, 'faulty run')}; original twin {percent(it.plain)}."
-        )
+            texts.append(f"{what}: {_share(found[key])}.")
     missing = use.missing
     few = next((found[k] for k in ("alarms", "called") if k in found), None)
     if few and missing and missing.what == "healthy" and missing.count:
@@ -114,7 +110,7 @@ def _missing(use: Use, *, faults: bool) -> str:
         "test": "more test runs",
         "runs": f"training it {several} times (give --runs)",
         "faults": "runs with known faults" if faults else "records with known faults",
-        "classifier": "an updated twin beside the original one",
+        "updated": "an updated twin beside the original one",
         "correction": "another correction",
         "source": f"a source within {percent(RATE)} false calls and {percent(DETECTION)} of faults",
         "real": "the same on real measurements",

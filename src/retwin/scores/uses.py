@@ -197,7 +197,8 @@ def _simulated_error(results: Results) -> tuple[ErrorChange, str, str] | None:
 def _simulate(results: Results, arrays: Arrays) -> Use:
     measured = error_of(results, arrays)
     if measured is None:
-        what = "healthy" if results.classes else "records"
+        healthy = HEALTHY in results.data.test.labels
+        what = "updated" if healthy else "healthy" if results.classes else "records"
         return Use(use="simulate", answer="cannot say", missing=Missing(what=what))
     change, unit, source = measured
     n, records = change.trajectories, not results.classes
@@ -326,7 +327,7 @@ def _training(it: _Diagnoses) -> Use:
     results = it.results
     names = [name for name in it.names(trained=True) if name != it.plain]
     if not names or not it.plain:
-        return Use(use="training", answer="cannot say", missing=Missing(what="classifier"))
+        return Use(use="training", answer="cannot say", missing=Missing(what="updated"))
     best = max(names, key=lambda name: results.sources[name].mean("macro_f1"))
     compared = results.compared(best, it.plain).get("macro_f1")
     whole = results.runs >= MIN_RUNS
