@@ -360,7 +360,7 @@ def test_the_first_screen_answers(browser: Browser, study_page: Path) -> None:
         assert page.locator("details.part[open]").count() == 0
         rows = page.locator(".uses tbody tr")
         assert rows.count() == 4
-        answers = [rows.nth(row).locator("td").first.inner_text() for row in range(4)]
+        answers = [rows.nth(row).locator("td").first.locator("b").inner_text() for row in range(4)]
         assert set(answers) <= {"yes", "likely", "cannot say", "no"}
         text = page.inner_text(".uses").replace("\u00a0", " ")
         assert re.search(r"Error [\d.]+ mm → [\d.]+ mm", text)

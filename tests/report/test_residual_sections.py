@@ -158,7 +158,7 @@ def learned(simulated: Content) -> Content:
 def test_each_section_of_a_simulation_begins_with_its_answer(learned: Content) -> None:
     study = study_of(learned)
     page = render(study, sections_of(study))
-    bodies = re.findall(r'<section id="(\w+)">.*?<p class="verdict">(.*?)</p>', page, re.DOTALL)
+    bodies = re.findall(r'<section id="(\w+)">.*?</h2><span>(.*?)</span></summ', page, re.DOTALL)
     answers = {name: re.sub(r"<[^>]+>", "", text) for name, text in bodies}
     assert {"scores", "simulation", "residuals", "delta", "card"} <= set(answers)
     assert answers["simulation"].startswith("From the commands alone, the error of the test")

@@ -64,8 +64,8 @@ def test_few_healthy_runs_are_said_to_be_too_few(study: Study, write: Write) -> 
     rows = {row.title: row for row in use_rows(read_study(write(study)).results)}
     assert rows["Monitor"].answer == "cannot say"
     assert rows["Monitor"].missing == "62 more healthy runs"
-    assert "10 healthy runs cannot decide 5 %" in rows["Monitor"].reached
-    assert "called faulty: 3 of 10; original twin 8." in rows["Diagnose"].reached
+    assert "10 healthy runs are too few to show that at most 5 %" in rows["Monitor"].reached
+    assert "called faulty: 3 of 10; original twin 8 of 10." in rows["Diagnose"].reached
 
 
 def test_a_study_without_an_updated_twin_lacks_one(study: Study, write: Write) -> None:
@@ -102,7 +102,15 @@ def test_page_terminal_and_file_agree(
     text = page.replace("\u00a0", " ")
     for index, row in enumerate(use_rows(whole.results)):
         cells = " ".join(str(list(column.cells)[index]) for column in table.columns)
-        for each in (row.title, row.answer, row.source, row.reached, row.missing):
+        for each in (
+            row.title,
+            row.required,
+            row.answer,
+            row.scope,
+            row.source,
+            row.reached,
+            row.missing,
+        ):
             assert each in cells
         assert f"<b>{row.answer}</b>" in text
         assert row.missing.replace("\u00a0", " ") in text

@@ -299,5 +299,6 @@ def _uses(results: Results) -> Table:
     rows = []
     for row in use_rows(results):
         reached = f"{row.source}: {row.reached}" if row.source else row.reached
-        rows.append((f"{row.title}\n{row.answer}", f"{reached}\nMissing: {row.missing}."))
-    return table(("use", "best source, and what it reaches"), rows)
+        answer = f"{row.title}\n{row.answer} {row.scope}".rstrip()
+        rows.append((answer, f"Requires {row.required}.\n{reached}\nMissing: {row.missing}."))
+    return table(("use", "best updated source, and what it reaches"), rows)

@@ -53,6 +53,8 @@ PAGES = "https://retwin.readthedocs.io/en/latest/"
 """The documentation."""
 DOCS = f"{PAGES}report.html"
 """The documentation of the page, to which each section links."""
+ANSWER = re.compile(r'<p class="verdict">(.*?)</p>', re.DOTALL)
+"""The first sentence of a section, which stands beside its title, also while it is closed."""
 
 
 def write_report(folder: str | os.PathLike[str], *, figures: bool = False) -> Path:
@@ -134,12 +136,15 @@ def render(study: Study, sections: Sequence[Section]) -> str:
         text = templates.get_template(f"{name}.html.j2").render(values)
         return Markup(re.sub(r"(?<=\d) (?=%)", "\u00a0", explained(text)))
 
+    bodies = {section.key: fill(section.key, section.values) for section in sections}
+    answers = {key: ANSWER.search(body) for key, body in bodies.items()}
     return render_page(
         templates,
         "page",
         [*front, *(figure for each in sections for figure in each.figures)],
         sections=sections,
-        bodies={section.key: fill(section.key, section.values) for section in sections},
+        bodies={key: Markup(ANSWER.sub("", body, count=1)) for key, body in bodies.items()},
+        answers={key: Markup(found[1]) for key, found in answers.items() if found},
         summary=fill("summary", {"summary": found}) if found else "",
         scripts={name: value for each in sections for name, value in each.scripts.items()},
     )

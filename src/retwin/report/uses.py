@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from retwin.report.labels import behind, counted, number, percent, percents, quantity, source_name
 from retwin.results import Figure, Results, Use
-from retwin.scores.uses import DETECTION, RATE
+from retwin.scores.uses import COVERAGE, DETECTION, RATE
 
 TITLES = {
     "simulate": "Simulate",
@@ -17,17 +17,21 @@ TITLES = {
 """Heads of the rows."""
 RULE = (
     "“Yes” and “no” need the whole 95 % interval within or outside the requirement; “likely” is a "
-    "value within it. The best source by its mean is shown; intervals do not contain that choice."
+    "value within it. The best updated source on these runs is shown: expect a little less."
 )
 """The one rule, as a sentence."""
 
 
 @dataclass(frozen=True)
 class UseRow:
-    """A row: the use, its answer, its best source ("" without one), what it reaches and lacks."""
+    """A row: the use, what it requires, its answer and where that holds ("" on real measurements),
+    its best source ("" without one), what it reaches and lacks.
+    """
 
     title: str
+    required: str
     answer: str
+    scope: str
     source: str
     reached: str
     missing: str
@@ -38,7 +42,9 @@ def use_rows(results: Results) -> list[UseRow]:
     return [
         UseRow(
             TITLES[use.use],
+            _required(use.use, classes=bool(results.classes)),
             use.answer,
+            "on emulated data" if results.emulated and use.answer != "cannot say" else "",
             source_name(use.source) if use.source else "",
             _reached(use),
             _missing(use, faults=bool(results.classes)),
@@ -47,15 +53,31 @@ def use_rows(results: Results) -> list[UseRow]:
     ]
 
 
+def _required(use: str, *, classes: bool) -> str:
+    """What a use requires, of a study with or without classes."""
+    error, bands = "a smaller error than the original twin's", f"90 % bands that hold {BANDS}"
+    if not classes and use in ("training", "monitor"):
+        return f"{error}, {bands}" if use == "training" else f"{bands}, and records with faults"
+    rarely = f"at most {percent(RATE)} of healthy runs called faulty"
+    return {
+        "simulate": error,
+        "training": "a better classifier than from the original twin's data",
+        "diagnose": f"{rarely}, {percent(DETECTION)} of faulty ones named",
+        "monitor": f"{rarely}, {percent(DETECTION)} of faulty ones found",
+    }[use]
+
+
 def _share(it: Figure) -> str:
     """A share with its interval, the original twin's beside; counts of runs that decide nothing."""
     if it.ends is None or it.ends[1] - it.ends[0] > WIDEST:
-        share, plain = f"{round(it.value * it.n)} of {it.n}", f"{it.plain * it.n:.0f}"
+        share, plain = (f"{round(each * it.n)} of {it.n}" for each in (it.value, it.plain))
     else:
         share, plain = f"{percent(it.value)} ({percents(it.ends)})", percent(it.plain)
     return f"{share}; original twin {plain}" if it.plain == it.plain else share
 
 
+BANDS = f"{100 * COVERAGE[0]:.0f} to {percent(COVERAGE[1])}"
+"""The shares of samples that a 90 % band may hold."""
 WIDEST = 0.3
 """The width of an interval of a share beyond which counts stand in its place."""
 
@@ -75,6 +97,8 @@ def _reached(use: Use) -> str:
     if "macro_f1" in found:
         score = found["macro_f1"]
         texts.append(f"Macro-F1 {number(score.value, 2)}; original twin {number(score.plain, 2)}.")
+        if score.value < score.plain:
+            texts.append("The original twin is better.")
     if "coverage" in found:
         band = found["coverage"]
         texts.append(
@@ -91,7 +115,10 @@ def _reached(use: Use) -> str:
     missing = use.missing
     few = next((found[k] for k in ("alarms", "called") if k in found), None)
     if few and missing and missing.what == "healthy" and missing.count:
-        texts.append(f"{counted(few.n, 'healthy run')} cannot decide {percent(RATE)}.")
+        texts.append(
+            f"{counted(few.n, 'healthy run')} are too few to show that at most {percent(RATE)} are "
+            "called faulty."
+        )
     joined = " ".join(texts) or "Not measured."
     return joined[:1].upper() + joined[1:]
 

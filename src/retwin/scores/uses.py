@@ -413,15 +413,18 @@ def _decided(
     for key, (low, high) in ranges.items():
         it = figures[key]
         interval = it.ends
-        fewest = _fewest(1.0 if low else 0.0, low, high)
+        best = 1.0 if low else 0.0
+        fewest = _fewest(best, low, high)
         informative = it.n >= fewest
         asked = Requirement(it.value, interval, low, high, informative)
         answer, missing = answer_of(asked), None
         if answer == "no":
             missing = Missing(what="source")
         elif answer != "yes":
-            needed = fewest if not informative else _fewest(it.value, low, high)
-            more = None if needed is None else max(needed, fewest) - it.n
+            needed = _fewest(it.value, low, high)
+            if not informative:  # the further ones may all be right
+                needed = _fewest(best, low, high, abs(it.value - best) * it.n)
+            more = max(needed, fewest) - it.n
             what = "healthy" if key == "called" else "faulty"
             missing = Missing(what=what, count=more) if more else Missing(what="source")
         found.append((answer, missing))
@@ -429,16 +432,17 @@ def _decided(
     return use.with_values(answer=answer, figures=dict(figures), missing=missing)
 
 
-def _fewest(share: float, low: float, high: float) -> int:
+def _fewest(share: float, low: float, high: float, errors: float = 0.0) -> int:
     """The smallest number of runs whose interval lies in the range if the share is this one.
 
-    0 if none does.
+    With `errors`, if so many runs are errors, however many there are. 0 if none does.
     """
     if not low <= share <= high:
         return 0
+    sign = -1 if low else 1
 
     def decides(n: int) -> bool:
-        ends = share_interval(share * n, n)
+        ends = share_interval(min(max(share * n + sign * errors, 0), n), n)
         return low <= ends[0] and ends[1] <= high * (1 + 1e-9)
 
     top = next((n for n in _powers() if decides(n)), 0)
