@@ -342,6 +342,42 @@ def test_saved_trajectories_are_matched_by_name_and_unit(place: Path, call) -> N
     assert contains(result(), "gain", 0.15)
 
 
+@pytest.mark.slow
+def test_columns_that_are_named_once_are_known_to_later_commands(place: Path, call) -> None:
+    for i in range(2):
+        text = Path(f"tank{i}.csv").read_text("utf-8")
+        Path(f"plant{i}.csv").write_text(text.replace("valve,level", "FIC 1,TT 2"), "utf-8")
+    named = ("--column", "valve=FIC 1", "--column", "level=TT 2")
+    logs = ["plant0.csv"]
+    code, _, err = call("identify", "tank.toml", *logs, *named, "--out", "out")
+    assert code == 0, err
+    case = rt.cases.get("out/updated.toml")
+    assert case.logs.names == {"valve": "FIC 1", "level": "TT 2"}
+    code, _, err = call("fit", "out/updated.toml", "--real", "plant0.csv", "--seed", "0",
+                        "--correction", "additive", "--no-compare", "--out", "model")  # fmt: skip
+    assert code == 0, err
+    for file in ("plant1.csv", "tank1.csv"):  # also one that names the channels themselves
+        code, out, err = call("evaluate", "model", "--real", file)
+        assert code == 0, err
+        assert "level" in out
+    code, _, err = call("evaluate", "model", "--real", "other.csv")
+    assert code == 2
+
+
+def test_a_mapping_is_remembered_too(place: Path, call) -> None:
+    Path("own.csv").write_text(
+        Path("tank0.csv").read_text("utf-8").replace("valve,level", "a,b"), "utf-8"
+    )
+    Path("m.toml").write_text(
+        'rate = 1\n[time]\nrate = 1\n[commands.valve]\nsignal = "a"\n'
+        '[outputs.level]\nsignal = "b"\n',
+        "utf-8",
+    )
+    code, _, err = call("identify", "tank.toml", "own.csv", "--mapping", "m.toml", "--out", "out")
+    assert code == 0, err
+    assert rt.cases.get("out/updated.toml").logs.mapping == Path("m.toml").resolve()
+
+
 def test_the_page_needs_nothing_else_and_shows_names_as_text(place: Path, call) -> None:
     name = "<img src=x onerror=alert(1)>.csv"
     Path(name).write_bytes(Path("tank0.csv").read_bytes())

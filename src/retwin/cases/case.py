@@ -9,6 +9,7 @@ from typing import Protocol
 
 from numpy.typing import NDArray
 
+from retwin.cases.named_signals import Columns
 from retwin.cases.recorded import RecordedCase
 from retwin.checks import agree, nothing, one_of, require
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -103,6 +104,8 @@ class Case(OfTwin):
     records : callable or None
         Splits a file into the calibration set and the test set of a benchmark; None if a file holds
         one set.
+    logs : Columns
+        How logs name the channels of the twin, where they have other names.
     dynamics : Dynamics
         The form of a discrepancy inside the state equations.
     state_surrogate : StateSurrogate
@@ -137,6 +140,7 @@ class Case(OfTwin):
     per_class: int = 400
     density: Density | SequenceMixture = Mixture()  # noqa: RUF009 - frozen
     records: Callable[[Path], tuple[Trajectories, Trajectories]] | None = None
+    logs: Columns = Columns()  # noqa: RUF009 - frozen
     dynamics: Dynamics = Dynamics()  # noqa: RUF009 - frozen
     state_surrogate: StateSurrogate = StateSurrogate()  # noqa: RUF009 - frozen
     causes: Mapping[str, Fault] = field(default_factory=dict)

@@ -19,6 +19,7 @@ from retwin import catalog
 from retwin.cases.based_on import merge_bases, parameters_of, updated_built_in
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
+from retwin.cases.named_signals import LogSettings
 from retwin.cases.named_twin import delayed_twin, imported, parametric_twin, read_twin
 from retwin.checks import agree, one_of, require
 from retwin.data.io import load
@@ -94,6 +95,7 @@ class CaseFile:
     network: Network | str | None = None
     training: Training | None = None
     records: _Columns | str | None = None
+    logs: LogSettings = LogSettings()  # noqa: RUF009 - frozen
 
 
 def read_case(path: str | Path) -> Case:
@@ -156,6 +158,7 @@ def read_case(path: str | Path) -> Case:
             training=keys.training,
             density=density,
             records=records,
+            logs=keys.logs.of_folder(home, key(place, "logs")),
             dynamics=keys.dynamics,
             state_surrogate=keys.state_surrogate,
             causes=causes,

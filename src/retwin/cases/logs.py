@@ -13,6 +13,7 @@ from retwin.cases.columns import ColumnRecords
 from retwin.cases.matching import match_twin
 from retwin.cases.measured import usable
 from retwin.cases.named_signals import (
+    Columns,
     check_named,
     has_times,
     mapping_by_names,
@@ -21,10 +22,10 @@ from retwin.cases.named_signals import (
     signals_of,
 )
 from retwin.catalog import LOGS
-from retwin.checks import at_least, finite, require
+from retwin.checks import at_least, require
 from retwin.data.io import load
 from retwin.data.logs.mapped import mapped
-from retwin.data.logs.mapping import NO_NOMINAL, TimeSettings, read_mapping
+from retwin.data.logs.mapping import NO_NOMINAL, read_mapping
 from retwin.data.logs.reading import is_log, read_log
 from retwin.data.logs.signals import Clock, Log
 from retwin.data.trajectories import Trajectories
@@ -36,39 +37,6 @@ ROUNDED = 1e-3
 """Relative accuracy to which a rate is rounded that is computed from times."""
 CHANGED = ("no number", " is read as ", " to ", "put in order", "with the time of another")
 """Words of notes about a channel whose values or times are not those of the log."""
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Which columns, or channels, of a log are the channels of a twin.
-
-    Parameters
-    ----------
-    names : mapping of str to str
-        Column, or signal, by channel of the twin; a channel that is not named has one of its name.
-    time : TimeSettings
-        Where the times of a table are; by default they are found by the name of their column.
-    transient : float
-        Duration in s at the begin of each trajectory whose outputs are not used, while the real
-        system still moves from a state that the twin does not start in.
-    mapping : path, optional
-        A mapping.toml, as for `rt.load`, for logs whose signals have times of their own; then
-        columns and times are those that it names.
-
-    Raises
-    ------
-    InputError
-        A transient that is no finite number of at least 0.
-
-    """
-
-    names: Mapping[str, str] = field(default_factory=dict)
-    time: TimeSettings = TimeSettings()  # noqa: RUF009 - frozen
-    transient: float = 0.0
-    mapping: str | Path | None = None
-
-    def __post_init__(self) -> None:
-        finite("transient", self.transient, at_least=0.0, unit="s", remedy="leave it out")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,18 +52,21 @@ class Logs:
         Those that the case itself keeps for a test; None if it keeps none.
     notes : tuple of str
         What was decided while reading, a sentence each: times, rates, outputs that are missing.
+    columns : Columns
+        Which columns were the channels.
 
     """
 
     trajectories: Trajectories
     test: Trajectories | None
     notes: tuple[str, ...]
+    columns: Columns = Columns()  # noqa: RUF009 - frozen
 
 
 def read_logs(
     paths: Sequence[str | Path],
     twin: Twin,
-    columns: Columns = Columns(),
+    columns: Columns = Columns(),  # noqa: B008 - frozen
     *,
     case: Case | None = None,
     rows_at_rate: bool = True,
@@ -152,7 +123,7 @@ class LogReader:
 
     """
 
-    columns: Columns = Columns()
+    columns: Columns = Columns()  # noqa: RUF009 - frozen
     max_bytes: int | None = None
     _read: dict[tuple[Path, Clock], Log] = field(default_factory=dict, repr=False)
 
@@ -228,7 +199,7 @@ class LogReader:
             tests += test
         joined = usable(Trajectories.concatenate(sets), notes, self.columns.transient)
         kept = Trajectories.concatenate(tests) if tests else None
-        return Logs(joined, kept, tuple(_sentences(notes)))
+        return Logs(joined, kept, tuple(_sentences(notes)), self.columns)
 
     def _check_columns(self, twin: Twin) -> None:
         """Refuse columns of channels that the twin does not have."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
-from retwin.checks import require
+from retwin.checks import finite, one_of, require
 from retwin.data.logs.mapping import ChannelMapping, Cut, TimeSettings
 from retwin.data.logs.mapping import Mapping as LogMapping
 from retwin.data.logs.proposal import channel_mapping, cut_at_pauses, shortest_pause
@@ -16,10 +18,99 @@ from retwin.data.resampling import longest_bridge
 from retwin.data.tables import EVEN, TIMES
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
+from retwin.serialisation.configs import key
 from retwin.twins.twin import Twin
 
 LISTED = 12
 """Signals that a message lists, at most."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Which columns, or channels, of a log are the channels of a twin.
+
+    Parameters
+    ----------
+    names : mapping of str to str
+        Column, or signal, by channel of the twin; a channel that is not named has one of its name.
+    time : TimeSettings
+        Where the times of a table are; by default they are found by the name of their column.
+    transient : float
+        Duration in s at the begin of each trajectory whose outputs are not used, while the real
+        system still moves from a state that the twin does not start in.
+    mapping : path, optional
+        A mapping.toml, as for `rt.load`, for logs whose signals have times of their own; then
+        columns and times are those that it names.
+
+    Raises
+    ------
+    InputError
+        A transient that is no finite number of at least 0.
+
+    """
+
+    names: Mapping[str, str] = field(default_factory=dict)
+    time: TimeSettings = TimeSettings()  # noqa: RUF009 - frozen
+    transient: float = 0.0
+    mapping: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        finite("transient", self.transient, at_least=0.0, unit="s", remedy="leave it out")
+
+    def of_channels(self, *channels: Channels) -> Columns:
+        """Those of some channels."""
+        every = {name for each in channels for name in each.names}
+        return replace(self, names={k: name for k, name in self.names.items() if k in every})
+
+
+def time_column(text: str, argument: str) -> TimeSettings:
+    """The column of the times from "NAME" or "NAME=UNIT"; "" for one that is found by its name.
+
+    Raises InputError, about `argument`, for a unit other than s, ms, us, ns and iso.
+    """
+    name, _, unit = text.partition("=")
+    one_of(argument, unit, ("", "s", "ms", "us", "ns", "iso"), remedy="write for instance stamp=ms")
+    return TimeSettings(column=name, unit=unit)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class LogSettings:
+    """How logs name channels: the column of each, that of the times, and what is not used of them.
+
+    Attributes
+    ----------
+    columns : dict of str to str
+        Column by channel, where it has another name.
+    time : str
+        Column of the times, with its unit as "stamp=ms"; "" for one that is found by its name.
+    transient : float
+        See `Columns`.
+    mapping : str
+        A mapping.toml beside the case, in place of these.
+
+    """
+
+    columns: dict[str, str] = field(default_factory=dict)
+    time: str = ""
+    transient: float = 0.0
+    mapping: str = ""
+
+    @classmethod
+    def of(cls, columns: Columns) -> LogSettings:
+        """Those that name these columns; a mapping by its absolute path."""
+        time, mapping = columns.time, columns.mapping
+        return cls(
+            dict(columns.names),
+            f"{time.column}={time.unit}" if time.unit else time.column,
+            columns.transient,
+            Path(mapping).resolve().as_posix() if mapping else "",
+        )
+
+    def of_folder(self, folder: Path, place: str) -> Columns:
+        """These of a case in a folder; InputError, about `place`, for a unit that is none."""
+        time = time_column(self.time, key(place, "time"))
+        mapping = folder / self.mapping if self.mapping else None
+        return Columns(self.columns, time, self.transient, mapping)
 
 
 def signals_of(log: Log, channels: Iterable[str], named: Mapping[str, str]) -> dict[str, str]:
@@ -108,23 +199,23 @@ def check_named(log: Log, twin: Twin, named: Mapping[str, str], *, table: bool) 
     )
     what, all_of = ("column", "columns") if table else ("signal", "signals")
     lacking = [each for each in twin.inputs.names if each not in found]
-    mapped = "or a mapping: retwin data map LOG --case TWIN --out mapping.toml"
+    mapped = (
+        "name it in [logs] of the case, as retwin identify --column does, or give a mapping: "
+        "retwin data map LOG --case TWIN --out mapping.toml"
+    )
     require(
         not lacking,
         log.name,
         expected=f"a {what} for every command, {', '.join(twin.inputs.names)}",
         got=f"{all_of} {_list(log.signals)}; none for {', '.join(lacking)}",
-        remedy=f"give --column {lacking[0]}=NAME, --inputs with the names of the inputs that "
-        f"were recorded, {mapped}"
-        if lacking
-        else "",
+        remedy=mapped,
     )
     require(
         any(each in found for each in twin.outputs.names),
         log.name,
         expected=f"a {what} for an output of the twin, {', '.join(twin.outputs.names)}",
         got=f"{all_of} {_list(log.signals)}",
-        remedy=f"give --column {twin.outputs.names[0]}=NAME, {mapped}",
+        remedy=mapped,
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 
+from retwin.cases.named_signals import Columns, LogSettings
 from retwin.cases.named_twin import FILES
 from retwin.cases.opened_twin import OpenedTwin
 from retwin.data.segments import Segments
@@ -34,6 +35,7 @@ def updated_case(
     commands: str,
     measured: Trajectories | None = None,
     spread: float = 1.0,
+    columns: Columns = Columns(),  # noqa: B008 - frozen
 ) -> str:
     """The text of a case.toml for a twin with identified parameters.
 
@@ -53,6 +55,8 @@ def updated_case(
         a case.
     spread : float, default 1
         Share of the ranges, about the values, over which `fit_state_surrogate` draws parameters.
+    columns : Columns
+        How the logs name the channels. A built-in case has names of its own.
 
     Returns
     -------
@@ -86,6 +90,7 @@ def updated_case(
         shows_states=bool(state_names(twin)),
         sufficient=SUFFICIENT,
         spread=spread,
+        logs={key: value for key, value in vars(LogSettings.of(columns)).items() if value},
         parameters=[(each, min(max(value, each.low), each.high)) for each, value in values],
     )
 

@@ -222,7 +222,7 @@ def _method(name: str, loss: str | None, starts: int | None) -> Any:
 def _columns(column: list[str] | None, time: str | None, transient: float) -> Columns:
     """Which columns of a log are the channels of the twin."""
     from retwin.cases import Columns
-    from retwin.data.logs.mapping import TimeSettings
+    from retwin.cases.named_signals import time_column
 
     names = {}
     for text in column or ():
@@ -235,9 +235,7 @@ def _columns(column: list[str] | None, time: str | None, transient: float) -> Co
             remedy="write for instance --column speed=omega_measured",
         )
         names[channel] = name
-    name, _, unit = (time or "").partition("=")
-    one_of("--time", unit, ("", "s", "ms", "us", "ns", "iso"), remedy="write for instance stamp=ms")
-    return Columns(names, TimeSettings(column=name, unit=unit), transient)  # type: ignore[arg-type]
+    return Columns(names, time_column(time or "", "--time"), transient)
 
 
 def _plan(opened: OpenedTwin, used: Any, method: str) -> str:

@@ -20,10 +20,12 @@ from retwin.serialisation.models import kind_of
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from retwin.cases import LogReader
     from retwin.cases.case import Case
     from retwin.data.quality.check import Checked
     from retwin.deploy.bundle.bundle import Bundle
     from retwin.deploy.onnx.portable import Portable
+    from retwin.twins.twin import Twin
     from retwin.update import CorrectedTwin, DynamicsTwin
 
 Part = Literal["all", "calibration", "test"]
@@ -157,13 +159,9 @@ def _read(
     divided = log and getattr(case, "records", None) is not None
     twin: Any = getattr(case, "twin", None)
     if divided or (log and is_log(file) and twin is not None):
-        from retwin.cases import LogReader
-
-        reader = LogReader(max_bytes=max_bytes)
+        reader = _log_reader(file, case, twin, max_bytes)
         if divided and is_log(file):  # one with the names of the channels is read by these
-            divided = not set(twin.inputs.names) <= set(reader.signals(file)) or not (
-                reader.measured_outputs([file], twin)
-            )
+            divided = not _names_channels(file, twin, max_bytes)
         own = case if divided else None
         found = reader.trajectories([file], twin, case=own)
         for text in found.notes:
@@ -181,6 +179,25 @@ def _read(
             max_bytes=max_bytes,
             mapping=mapping,
         )
+
+
+def _log_reader(file: Path, case: Any, twin: Twin, max_bytes: int | None = None) -> LogReader:
+    """A reader of a log by the names of the channels, else by the columns that the case states."""
+    from retwin.cases import Columns, LogReader
+
+    stated = getattr(case, "logs", Columns())
+    if not is_log(file) or _names_channels(file, twin, max_bytes):
+        stated = Columns(transient=stated.transient)
+    return LogReader(stated.of_channels(twin.inputs, twin.outputs), max_bytes)
+
+
+def _names_channels(file: Path, twin: Twin, max_bytes: int | None) -> bool:
+    """Whether a log has signals with the names of all commands and of an output."""
+    from retwin.cases import LogReader
+
+    reader = LogReader(max_bytes=max_bytes)
+    commands = set(twin.inputs.names) <= set(reader.signals(file))
+    return commands and bool(reader.measured_outputs([file], twin))
 
 
 def read_signals(files: Sequence[Path], max_bytes: int | None = None) -> Trajectories:
@@ -210,11 +227,10 @@ def read_signals(files: Sequence[Path], max_bytes: int | None = None) -> Traject
 
 def read_commands(file: Path, case: Case, *, mapping: Path | None = None) -> Trajectories:
     """The same to be simulated: a table may hold the commands alone."""
-    from retwin.cases import LogReader
     from retwin.twins import FunctionTwin
 
     twin, table = case.twin, mapping is None and file.is_file() and is_log(file)
-    if not table or LogReader().measured_outputs([file], twin):
+    if not table or _log_reader(file, case, twin).measured_outputs([file], twin):
         return read(file, case, mapping=mapping)
     # A twin whose outputs are its commands, so that no output is missing.
     alone = FunctionTwin(lambda u: u, rate=twin.rate, inputs=twin.inputs, outputs=twin.inputs)

@@ -95,6 +95,7 @@ def save_identification(
             "logs.npz",
             logs.trajectories,
             spread_of(found.parameters),
+            logs.columns,
         )
         (part / "updated.toml").write_text(text, encoding="utf-8")
         values["updated_case"] = _refused(part / "updated.toml", found.twin)
