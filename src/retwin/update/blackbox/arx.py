@@ -31,7 +31,6 @@ from retwin.update.blackbox.estimate import (
     BlackBoxFit,
     best_order,
     check_records,
-    coefficients_of,
     cross_validated,
     estimation_of,
     followed,
@@ -39,6 +38,7 @@ from retwin.update.blackbox.estimate import (
 )
 from retwin.update.blackbox.lags import Lags, least_squares
 from retwin.update.dynamics.estimation import Point
+from retwin.update.dynamics.unknowns import coefficients_of
 
 MAX_ORDER = 8
 """Largest number of past samples that is tried."""

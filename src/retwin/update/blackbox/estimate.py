@@ -7,7 +7,7 @@ is estimated, simulated, saved and used as a twin with corrected dynamics is.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,6 @@ from retwin.progress import Progress
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
-from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.estimation import Estimation, Point, correlation_time
 from retwin.update.dynamics.fitting import assembled
@@ -51,8 +50,6 @@ MAX_PASSES = 6
 """Times that the error of the outputs is estimated anew."""
 SAME = 0.1
 """Logarithm of the ratio of two variances below which they agree."""
-WIDEST = 1e9
-"""Bound of coefficients, which their priors or the samples keep much smaller."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,14 +242,6 @@ def estimation_of(twin: StateTwin, observed: Trajectories, part: NDArray) -> Est
     base, free, values = state_twin_of(twin)
     unknowns, seen = unknowns_of(base, free, values), observed.mask & ~part[..., None]
     return Estimation(base, observed, unknowns, seen, np.ones(len(base.outputs)))
-
-
-def coefficients_of(names: Iterable[str], values: NDArray) -> list[Parameter]:
-    """The free parameters of a model, which have no unit and hardly a bound."""
-    return [
-        Parameter(name, "1", -WIDEST, WIDEST, value)
-        for name, value in zip(names, values.ravel().tolist(), strict=True)
-    ]
 
 
 def states_within(starts: NDArray, bound: float) -> list[State]:

@@ -17,10 +17,11 @@ from retwin.data.trajectories import Trajectories
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import Parameter
-from retwin.update.blackbox.estimate import WIDEST, BlackBox
+from retwin.update.blackbox.estimate import BlackBox
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import correlation_time
 from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.unknowns import WIDEST
 
 
 def fit_levels(observed: Trajectories) -> BlackBox:

@@ -29,12 +29,12 @@ from retwin.update.blackbox.estimate import (
     BlackBoxFit,
     best_order,
     check_records,
-    coefficients_of,
     estimation_of,
     with_best_prior,
 )
 from retwin.update.blackbox.lags import ROWS_PER_TERM, Lags, least_squares
 from retwin.update.dynamics.estimation import Estimation, Point
+from retwin.update.dynamics.unknowns import coefficients_of
 
 DEGREE = 3
 """Highest degree of the monomials; it is lowered for many variables, see `Library`."""
