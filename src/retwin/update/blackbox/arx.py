@@ -96,10 +96,10 @@ class Linear:
 
     def twin(self, theta: NDArray) -> StateTwin:
         """The model in observer form, its parameters beginning at coefficients (d_y, k)."""
-        observed, scales = self.lags.observed, self.lags.scales
+        observed, lags = self.lags.observed, self.lags
         width, _, n = self.sizes
-        centre, scale = torch.tensor(scales.commands.centre), torch.tensor(scales.commands.scale)
-        level, height = torch.tensor(scales.outputs.centre), torch.tensor(scales.outputs.scale)
+        centre, scale = torch.tensor(lags.commands.centre), torch.tensor(lags.commands.scale)
+        level, height = torch.tensor(lags.outputs.centre), torch.tensor(lags.outputs.scale)
 
         def scaled(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
             constant, a, b = self.parts(torch.stack(list(p)).reshape(theta.shape))
@@ -135,9 +135,9 @@ class Linear:
 
     def starts(self, theta: NDArray) -> NDArray:
         """States (records, n d_y) at the first samples, as if each record had been at rest."""
-        (y, u), scales = self.lags.first, self.lags.scales
-        y = (y - scales.outputs.centre) / scales.outputs.scale
-        u = (u - scales.commands.centre) / scales.commands.scale
+        (y, u), lags = self.lags.first, self.lags
+        y = (y - lags.outputs.centre) / lags.outputs.scale
+        u = (u - lags.commands.centre) / lags.commands.scale
         constant, a, b = self.parts(theta)
         later, found = np.zeros_like(y), list[NDArray]()
         for i in reversed(range(len(a))):

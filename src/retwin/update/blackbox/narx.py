@@ -89,7 +89,7 @@ class Polynomial:
     def twin(self, chosen: list[list[int]], coefficients: NDArray) -> StateTwin:
         """The model with some terms of each output; its states are the past samples."""
         lags, observed = self.lags, self.lags.observed
-        names, outputs = [each.name for each in lags.terms], lags.scales.outputs
+        names, outputs = [each.name for each in lags.terms], lags.outputs
         level, height = outputs.centre.tolist(), outputs.scale.tolist()
         width, past = len(observed.outputs), len(observed.outputs) * (lags.order - 1)
         inputs = len(observed.inputs)
@@ -172,7 +172,7 @@ class Polynomial:
         observed = self.lags.observed
         y = np.where(observed.mask, observed.observed, np.nan).astype(np.float64)
         speed = np.sqrt(np.nanmean(np.diff(y, axis=1) ** 2, axis=(0, 1)))
-        size = np.repeat(speed / self.lags.scales.outputs.scale, [len(own) for own in chosen])
+        size = np.repeat(speed / self.lags.outputs.scale, [len(own) for own in chosen])
         nonlinear = np.concatenate(chosen) > len(self.lags.domain.low)
         unknowns = replace(
             estimation.unknowns,

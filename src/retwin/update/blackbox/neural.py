@@ -130,8 +130,8 @@ def begin_with(
         "b": rng.normal(size=hidden),
         "W": np.zeros((size, hidden)),
     }
-    scales = linear.lags.scales
     commands, outputs = (
-        ChannelScale(each.centre, each.scale) for each in (scales.commands, scales.outputs)
+        ChannelScale(each.centre, each.scale)
+        for each in (linear.lags.commands, linear.lags.outputs)
     )
     return Equations(arrays, np.where(speed > 0, speed, 1.0), commands, outputs), white[:, 0]
