@@ -20,8 +20,8 @@ from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.blackbox.estimate import BlackBox
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import correlation_time
+from retwin.update.dynamics.terms import WIDEST
 from retwin.update.dynamics.twin import DynamicsTwin
-from retwin.update.dynamics.unknowns import WIDEST
 
 
 def fit_levels(observed: Trajectories) -> BlackBox:

@@ -12,11 +12,9 @@ from scipy.linalg import block_diag
 from retwin.checks import require
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
+from retwin.update.dynamics.terms import WIDEST
 
-__all__ = ["WIDEST", "Unknowns", "coefficients_of", "state_names", "state_twin_of", "unknowns_of"]
-
-WIDEST = 1e9
-"""Bound of coefficients, which their priors or the samples keep much smaller."""
+__all__ = ["Unknowns", "coefficients_of", "state_names", "state_twin_of", "unknowns_of"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.estimation import Estimation
 from retwin.update.dynamics.linearised import Point
-from retwin.update.dynamics.unknowns import Unknowns, state_twin_of
+from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
 
 RESOLUTION = 1e-3
 """Error of a sample, over the standard deviation of its output, to a hundredth of which the starts
@@ -105,21 +105,15 @@ class Windows:
     def _unknowns(self, twin: ParametricTwin) -> Unknowns:
         """The starts as unknowns, at the parameters of a twin, without any prior."""
         base, _, values = state_twin_of(twin)
-        parameters, free = len(base.parameters), np.flatnonzero(self.unknown)
-        given = np.array([values[name] for name in base.names])
+        free = np.flatnonzero(self.unknown)
         bounds = [
             (-np.inf, np.inf) if each.low is None else (each.low, each.high) for each in base.states
         ]
         low, high = np.array(bounds, dtype=float).T
-        return Unknowns(
-            names=(),
-            offset=given[:parameters],
-            matrix=np.zeros((parameters, 0)),
-            mean=np.zeros(0),
-            deviation=np.zeros(0),
+        return replace(
+            unknowns_of(base, (), values),
             low=low[free],
             high=high[free],
-            start=given[parameters:],
             free=free,
             start_deviation=np.full(len(free), np.inf),
         )
