@@ -6,7 +6,6 @@ is estimated, simulated, saved and used as a twin with corrected dynamics is.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -67,13 +66,13 @@ class BlackBox:
         and `held_out`, that of blocks left out, in output units, or relative to each output's
         standard deviation where units differ.
     seconds : float
-        Duration.
+        Duration of `fit_black_box`.
 
     """
 
     twin: DynamicsTwin | CorrectedTwin
     figures: dict[str, float]
-    seconds: float
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,15 +111,16 @@ class BlackBoxFit:
         found = estimation.minimised(estimation.linearised(self.point), SEARCH)
         return replace(self, estimation=estimation, point=found.point)
 
-    def model(self, order: int, began: float, corrected: Sequence[str]) -> BlackBox:
-        """The model as a distribution; the equations of the states `corrected` have noise."""
+    def model(self, order: int, corrected: int) -> BlackBox:
+        """The model as a distribution; the equations of so many first states have noise."""
         estimation, point = self.estimation, self.point
         steps = np.diff(estimation.simulated(point)[1], axis=1)
         speed = np.sqrt(np.mean(steps**2, axis=(0, 1)))
         found = estimation.linearised(point)
         speed, whole = np.where(speed > 0, speed, 1.0), [np.full(estimation.seen.shape[:2], True)]
         unmoved = np.zeros((1, estimation.unknowns.count))
-        made = assembled(estimation, found, tuple(corrected), speed, whole, unmoved)
+        names = tuple(each.name for each in estimation.twin.states[:corrected])
+        made = assembled(estimation, found, names, speed, whole, unmoved)
         uncertain = held_out(estimation, found, held_out_parts(estimation.seen))
         made = replace(
             made, widening=widening(made, self._tested, replace(uncertain, errors=self.errors))
@@ -131,7 +131,7 @@ class BlackBoxFit:
             "rms": estimation.rms(estimation.residual(point)),
             "held_out": self.held_out,
         }
-        return BlackBox(made, figures, time.perf_counter() - began)
+        return BlackBox(made, figures)
 
 
 def check_records(observed: Trajectories) -> None:

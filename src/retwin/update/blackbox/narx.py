@@ -13,7 +13,6 @@ spatio-temporal domains" (2013), chapters 2 and 3.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -62,15 +61,13 @@ def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> Bl
     Forward regression adds nonlinear terms to the linear ones, by the share of the variance that
     each explains beyond those before it. They have a Gaussian prior about 0.
     """
-    began = time.perf_counter()
     check_records(observed)
 
     def fit(order: int) -> BlackBoxFit | None:
         return Polynomial(Lags(observed, order, DEGREE)).fit()
 
     order, found = best_order(range(1, MAX_ORDER + 1), fit, progress)
-    names = [each.name for each in found.estimation.twin.states]
-    return found.model(order, began, names[: len(observed.outputs)])
+    return found.model(order, len(observed.outputs))
 
 
 @dataclass(frozen=True, eq=False)

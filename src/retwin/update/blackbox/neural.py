@@ -16,7 +16,6 @@ Conference (2021).
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -51,7 +50,6 @@ def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) 
     It has as many states per output as the best linear model has past samples, or one more, and a
     hidden layer whose width depends on the number of samples.
     """
-    began = time.perf_counter()
     report = progress or (lambda _: None)
     linear, _ = best_linear(observed, lambda share: report(0.2 * share))
 
@@ -75,8 +73,7 @@ def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) 
 
     orders = range(linear.lags.order, linear.lags.order + 2)
     order, found = best_order(orders, fit, lambda share: report(0.2 + 0.8 * share))
-    names = [each.name for each in found.estimation.twin.states]
-    return found.model(order, began, names)
+    return found.model(order, len(found.estimation.twin.states))
 
 
 def begin_with(
