@@ -133,19 +133,19 @@ class Windows:
 
     @lru_cache(maxsize=1)  # noqa: B019 - the search asks for residuals, then for derivatives there
     def _at(self, theta: tuple[float, ...]) -> tuple[NDArray, NDArray, NDArray]:
-        """Starts (w, m), outputs (w, L, d_y) and derivatives by all parameters of `StateTwin`."""
+        """States (w, d_x) at the first samples, outputs (w, L, d_y), and their derivatives.
+
+        These are by all parameters of `StateTwin`.
+        """
         twin = self.twin.with_values(theta)
         own = replace(self._estimation, unknowns=self._unknowns(twin))
-        starts = self._search(own, self._present)
-        point = own.theta(Point(np.zeros(0), starts))
+        point = own.theta(Point(np.zeros(0), self._search(own, self._present)))
         outputs, slopes = own.twin.steps().sensitivities(own.commands, point)
-        return starts, outputs, slopes
+        return point[:, len(own.twin.parameters) :], outputs, slopes
 
     def starts(self, theta: NDArray) -> NDArray:
         """The states (w, d_x) at the first sample of each window, at parameters (k,)."""
-        own = replace(self._estimation, unknowns=self._unknowns(self.twin.with_values(theta)))
-        found = self._at(tuple(theta.tolist()))[0]
-        return own.theta(Point(np.zeros(0), found))[:, len(own.twin.parameters) :]
+        return self._at(tuple(theta.tolist()))[0]
 
     def with_starts(self, theta: NDArray) -> NDArray:
         """Parameters (k,) with those that are starts at the mean of what the trajectories have."""
