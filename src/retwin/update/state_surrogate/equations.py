@@ -5,6 +5,7 @@
 
 v are the commands and the parameters of the twin, in scaled units. All simulations of a twin begin
 at the same state, or at one that its parameters determine, which is 0 in suitable coordinates.
+A neural black box has the same equations without Y, from unknown starts.
 
 References
 ----------
