@@ -26,6 +26,11 @@ class ResumedStage(str):
     __slots__ = ()
 
 
+def part_of(progress: Progress | None, done: int, parts: int) -> Progress | None:
+    """The progress of one of several equal parts of the work, after so many that are done."""
+    return progress and (lambda share: progress((done + share) / parts))
+
+
 def tracked(items: Iterable[Item], count: int, progress: Progress | None) -> Iterator[Item]:
     """The items, of which there are so many; after each, the share that is done is reported."""
     for done, item in enumerate(items, 1):

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from retwin.checks import whole
-from retwin.data.trajectories import Channels, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import read_about, refusing, write_model
 from retwin.serialisation.sizes import Budget
@@ -25,6 +25,7 @@ from retwin.twins.twin import (
     checked_seed,
     simulate_in_chunks,
 )
+from retwin.twins.wrappers.wrapper import OfTwin
 from retwin.update.corrections import measuring
 from retwin.update.exact import ExactSurrogate, exact_surrogate, load_surrogate
 from retwin.update.forecast_errors import ForecastErrors
@@ -40,7 +41,7 @@ BYTES_PER_NUMBER = 4
 
 
 @dataclass(frozen=True, eq=False)
-class CorrectedTwin:
+class CorrectedTwin(OfTwin):
     """The updated twin, ỹ = g(ŷ, z) with z from the residual model; satisfies `Twin` again.
 
     Parameters
@@ -63,26 +64,12 @@ class CorrectedTwin:
     case: str = ""
     random: bool = True
     forecast: ForecastErrors | None = None
+    _field: ClassVar[str] = "surrogate"
 
     def __post_init__(self) -> None:
         # To simulate, z is applied once: no differences are taken.
         exact = exact_surrogate(self.surrogate, differences=False)
         object.__setattr__(self, "surrogate", exact)
-
-    @property
-    def inputs(self) -> Channels:
-        """Command channels."""
-        return self.surrogate.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels."""
-        return self.surrogate.outputs
-
-    @property
-    def rate(self) -> float:
-        """Sample rate in Hz."""
-        return self.surrogate.rate
 
     @property
     def onsets(self) -> NDArray:

@@ -131,7 +131,9 @@ class ExactSurrogate(OfTwin):
         if values is None:
             return cls(twin, differences=False)
         own = twin if isinstance(twin, ParametricTwin) else None
-        return cls(require_parameters(own, name).with_values(values), differences=False)
+        expected = "a case that declares the parameters of its twin, as when the model was saved"
+        own = given(name, own, expected, got="none", remedy="restore its table [parameters]")
+        return cls(own.with_values(values), differences=False)
 
 
 def load_surrogate(folder: str | Path, twin: Twin | None = None) -> Surrogate:
@@ -142,15 +144,6 @@ def load_surrogate(folder: str | Path, twin: Twin | None = None) -> Surrogate:
     if kind_of(folder) in (KIND, DynamicsTwin.kind):
         return ExactSurrogate.load(folder, twin)  # type: ignore[return-value]  # it has what is used
     return Surrogate.load(folder)
-
-
-def require_parameters(parametric: ParametricTwin | None, case: str) -> ParametricTwin:
-    """The twin of a case with its parameters.
-
-    Raises InputError where the case does not declare them any more.
-    """
-    expected = "a case that declares the parameters of its twin, as when the model was saved"
-    return given(case, parametric, expected, got="none", remedy="restore its table [parameters]")
 
 
 def with_present_values(twin: StateTwin | ParametricTwin) -> StateTwin:

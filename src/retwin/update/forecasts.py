@@ -16,6 +16,7 @@ from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive
 from retwin.update.dynamics.estimation import correlation_time
+from retwin.update.dynamics.filtering import arrays_of
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.forecast_errors import (
     BEYOND,
@@ -117,9 +118,8 @@ def _last_measured(error: NDArray) -> NDArray:
 
 def _from_states(twin: DynamicsTwin, record: Trajectories, leads: Sequence[int]) -> NDArray:
     """Simulations that start from filtered states at some samples, (L, n, T, d_y)."""
-    commands = record.commands.astype(np.float64)
-    measured = np.where(record.mask, record.observed, 0.0).astype(np.float64)
-    states = twin.filter(commands, measured, record.mask)[2]
+    commands, *rest = arrays_of(record)
+    states = twin.filter(commands, *rest)[2]
     count, steps = commands.shape[:2]
     longest = min(max(leads), steps - 1)
     stride = max(1, count * steps // ORIGINS)

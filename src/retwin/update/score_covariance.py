@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.stats import t as student
 
+NORMAL_95 = 1.96
+"""Standard errors from an estimate to an end of its 95 % interval."""
 BLOCKS = 8
 """Blocks of time over which residuals are summed, of all trajectories together."""
 SHARED = 0.5

@@ -130,7 +130,7 @@ def _black_box(healthy: Trajectories) -> object:
     """What stands for a twin where there is none."""
     if len(healthy.inputs):
         return fit_black_box(healthy, "arx").twin
-    return fit_levels(healthy).twin
+    return fit_levels(healthy)
 
 
 @dataclass(frozen=True, eq=False)

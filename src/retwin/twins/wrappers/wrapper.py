@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,35 +20,29 @@ INNER_TWIN = 1
 
 
 class OfTwin:
-    """What has the channels and the sample rate of its twin.
+    """What has the channels and the sample rate of its twin."""
 
-    Attributes
-    ----------
-    twin : Twin
-        A field of the subclass.
+    _field: ClassVar[str] = "twin"
+    """The field of the subclass that is the twin."""
 
-    """
-
-    if TYPE_CHECKING:
-
-        @property
-        def twin(self) -> Twin:
-            """The twin."""
+    @property
+    def _inner(self) -> Twin:
+        return getattr(self, self._field)
 
     @property
     def inputs(self) -> Channels:
         """Command channels."""
-        return self.twin.inputs
+        return self._inner.inputs
 
     @property
     def outputs(self) -> Channels:
         """Output channels."""
-        return self.twin.outputs
+        return self._inner.outputs
 
     @property
     def rate(self) -> float:
         """Sample rate in Hz."""
-        return self.twin.rate
+        return self._inner.rate
 
 
 class TwinWrapper(OfTwin):
@@ -57,12 +51,12 @@ class TwinWrapper(OfTwin):
     @property
     def limits(self) -> Limits | None:
         """Range of the commands; None where the wrapped twin declares none."""
-        return getattr(self.twin, "limits", None)
+        return getattr(self._inner, "limits", None)
 
     @property
     def shiftable(self) -> tuple[str, ...]:
         """Parameters that can change during a simulation."""
-        return getattr(self.twin, "shiftable", ())
+        return getattr(self._inner, "shiftable", ())
 
 
 def simulate_chunk(

@@ -5,7 +5,9 @@ Belongs here: models whose equations know nothing of the system. Not here: corre
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -72,8 +74,10 @@ def fit_black_box(
         free simulation stays finite.
 
     """
-    fit = BLACK_BOXES[one_of("kind", kind, BLACK_BOXES)]
+    began, fit = time.perf_counter(), BLACK_BOXES[one_of("kind", kind, BLACK_BOXES)]
     with np.errstate(over="ignore", invalid="ignore"):  # of models that diverge, and are not chosen
         if fit is fit_lstm:
-            return fit_lstm(observed, checked_seed(seed), progress, members)
-        return fit(observed, checked_seed(seed), progress)
+            found = fit_lstm(observed, checked_seed(seed), progress, members)
+        else:
+            found = fit(observed, checked_seed(seed), progress)
+    return replace(found, seconds=time.perf_counter() - began)

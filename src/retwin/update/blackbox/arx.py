@@ -14,7 +14,6 @@ L. Ljung, "System identification: theory for the user" (1999), chapters 4 and 7.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -31,7 +30,6 @@ from retwin.update.blackbox.estimate import (
     BlackBoxFit,
     best_order,
     check_records,
-    coefficients_of,
     cross_validated,
     estimation_of,
     followed,
@@ -39,6 +37,7 @@ from retwin.update.blackbox.estimate import (
 )
 from retwin.update.blackbox.lags import Lags, least_squares
 from retwin.update.dynamics.estimation import Point
+from retwin.update.dynamics.unknowns import coefficients_of
 
 MAX_ORDER = 8
 """Largest number of past samples that is tried."""
@@ -48,10 +47,8 @@ START = 10.0
 
 def fit_arx(observed: Trajectories, seed: int, progress: Progress | None) -> BlackBox:
     """The linear model of the order that predicts held-out blocks best; it needs no seed."""
-    began = time.perf_counter()
     linear, fit = best_linear(observed, progress)
-    names = [each.name for each in fit.estimation.twin.states]
-    return fit.model(linear.lags.order, began, names[: len(observed.outputs)])
+    return fit.model(linear.lags.order, len(observed.outputs))
 
 
 def best_linear(
@@ -96,10 +93,10 @@ class Linear:
 
     def twin(self, theta: NDArray) -> StateTwin:
         """The model in observer form, its parameters beginning at coefficients (d_y, k)."""
-        observed, scales = self.lags.observed, self.lags.scales
+        observed, lags = self.lags.observed, self.lags
         width, _, n = self.sizes
-        centre, scale = torch.tensor(scales.commands.centre), torch.tensor(scales.commands.scale)
-        level, height = torch.tensor(scales.outputs.centre), torch.tensor(scales.outputs.scale)
+        centre, scale = torch.tensor(lags.commands.centre), torch.tensor(lags.commands.scale)
+        level, height = torch.tensor(lags.outputs.centre), torch.tensor(lags.outputs.scale)
 
         def scaled(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
             constant, a, b = self.parts(torch.stack(list(p)).reshape(theta.shape))
@@ -135,9 +132,9 @@ class Linear:
 
     def starts(self, theta: NDArray) -> NDArray:
         """States (records, n d_y) at the first samples, as if each record had been at rest."""
-        (y, u), scales = self.lags.first, self.lags.scales
-        y = (y - scales.outputs.centre) / scales.outputs.scale
-        u = (u - scales.commands.centre) / scales.commands.scale
+        (y, u), lags = self.lags.first, self.lags
+        y = (y - lags.outputs.centre) / lags.outputs.scale
+        u = (u - lags.commands.centre) / lags.commands.scale
         constant, a, b = self.parts(theta)
         later, found = np.zeros_like(y), list[NDArray]()
         for i in reversed(range(len(a))):

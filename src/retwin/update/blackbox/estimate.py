@@ -6,8 +6,7 @@ is estimated, simulated, saved and used as a twin with corrected dynamics is.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +19,6 @@ from retwin.progress import Progress
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
-from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.estimation import Estimation, Point, correlation_time
 from retwin.update.dynamics.fitting import assembled
@@ -51,8 +49,6 @@ MAX_PASSES = 6
 """Times that the error of the outputs is estimated anew."""
 SAME = 0.1
 """Logarithm of the ratio of two variances below which they agree."""
-WIDEST = 1e9
-"""Bound of coefficients, which their priors or the samples keep much smaller."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +66,13 @@ class BlackBox:
         and `held_out`, that of blocks left out, in output units, or relative to each output's
         standard deviation where units differ.
     seconds : float
-        Duration.
+        Duration of `fit_black_box`.
 
     """
 
     twin: DynamicsTwin | CorrectedTwin
     figures: dict[str, float]
-    seconds: float
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +111,16 @@ class BlackBoxFit:
         found = estimation.minimised(estimation.linearised(self.point), SEARCH)
         return replace(self, estimation=estimation, point=found.point)
 
-    def model(self, order: int, began: float, corrected: Sequence[str]) -> BlackBox:
-        """The model as a distribution; the equations of the states `corrected` have noise."""
+    def model(self, order: int, corrected: int) -> BlackBox:
+        """The model as a distribution; the equations of so many first states have noise."""
         estimation, point = self.estimation, self.point
         steps = np.diff(estimation.simulated(point)[1], axis=1)
         speed = np.sqrt(np.mean(steps**2, axis=(0, 1)))
         found = estimation.linearised(point)
         speed, whole = np.where(speed > 0, speed, 1.0), [np.full(estimation.seen.shape[:2], True)]
         unmoved = np.zeros((1, estimation.unknowns.count))
-        made = assembled(estimation, found, tuple(corrected), speed, whole, unmoved)
+        names = tuple(each.name for each in estimation.twin.states[:corrected])
+        made = assembled(estimation, found, names, speed, whole, unmoved)
         uncertain = held_out(estimation, found, held_out_parts(estimation.seen))
         made = replace(
             made, widening=widening(made, self._tested, replace(uncertain, errors=self.errors))
@@ -134,7 +131,7 @@ class BlackBoxFit:
             "rms": estimation.rms(estimation.residual(point)),
             "held_out": self.held_out,
         }
-        return BlackBox(made, figures, time.perf_counter() - began)
+        return BlackBox(made, figures)
 
 
 def check_records(observed: Trajectories) -> None:
@@ -245,14 +242,6 @@ def estimation_of(twin: StateTwin, observed: Trajectories, part: NDArray) -> Est
     base, free, values = state_twin_of(twin)
     unknowns, seen = unknowns_of(base, free, values), observed.mask & ~part[..., None]
     return Estimation(base, observed, unknowns, seen, np.ones(len(base.outputs)))
-
-
-def coefficients_of(names: Iterable[str], values: NDArray) -> list[Parameter]:
-    """The free parameters of a model, which have no unit and hardly a bound."""
-    return [
-        Parameter(name, "1", -WIDEST, WIDEST, value)
-        for name, value in zip(names, values.ravel().tolist(), strict=True)
-    ]
 
 
 def states_within(starts: NDArray, bound: float) -> list[State]:

@@ -20,35 +20,6 @@ ROWS_PER_TERM = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Scales:
-    """Centres and half widths of the ranges of outputs and commands in calibration.
-
-    Attributes
-    ----------
-    outputs, commands : Domain
-        Of the d_y outputs, measured samples alone, and of the d_u commands.
-
-    """
-
-    outputs: Domain
-    commands: Domain
-
-    @classmethod
-    def of(cls, observed: Trajectories) -> Scales:
-        """The scales of records."""
-        y = np.where(observed.mask, observed.observed, np.nan).astype(np.float64)
-        u = observed.commands.astype(np.float64)
-        ranges = [
-            [make(each, axis=(0, 1)) for make in (np.nanmin, np.nanmax, np.nanmean)]
-            for each in (y, u)
-        ]
-        outputs, commands = (
-            Domain(low, high, mean, np.ones(len(low))) for low, high, mean in ranges
-        )
-        return cls(outputs, commands)
-
-
-@dataclass(frozen=True, eq=False)
 class MeasuredRows:
     """The samples before which enough samples are measured.
 
@@ -100,9 +71,14 @@ class Lags:
     degree: int
 
     @cached_property
-    def scales(self) -> Scales:
-        """Scales of the channels."""
-        return Scales.of(self.observed)
+    def outputs(self) -> Domain:
+        """Ranges of the d_y outputs in calibration, of measured samples alone."""
+        return _ranges_of(np.where(self.observed.mask, self.observed.observed, np.nan))
+
+    @cached_property
+    def commands(self) -> Domain:
+        """Ranges of the d_u commands in calibration."""
+        return _ranges_of(self.observed.commands)
 
     @cached_property
     def names(self) -> list[str]:
@@ -118,7 +94,7 @@ class Lags:
     @cached_property
     def domain(self) -> Domain:
         """Ranges of the variables."""
-        y, u = self.scales.outputs, self.scales.commands
+        y, u = self.outputs, self.commands
         low, high, mean = (
             np.concatenate([*[a] * self.order, *[b] * (self.order + 1)])
             for a, b in ((y.low, u.low), (y.high, u.high), (y.mean, u.mean))
@@ -160,7 +136,7 @@ class Lags:
         variables = torch.tensor(np.concatenate([*past, u[record, sample]], axis=1))
         ones = torch.ones(len(variables), dtype=torch.float64)
         columns = [each * ones for each in self.values(list(variables.unbind(1)))]
-        outputs = (y[record, sample] - self.scales.outputs.centre) / self.scales.outputs.scale
+        outputs = (y[record, sample] - self.outputs.centre) / self.outputs.scale
         return MeasuredRows(torch.stack(columns, 1).numpy(), outputs, record, sample)
 
     @cached_property
@@ -176,6 +152,13 @@ class Lags:
         known = mask.any(axis=1)
         mean = np.where(known, found, 0.0).sum(axis=0) / known.sum(axis=0)
         return np.where(known, found, mean), self.observed.commands[:, 0].astype(np.float64)
+
+
+def _ranges_of(values: NDArray) -> Domain:
+    """Ranges (d,) of values (n, T, d), of which some may be NaN."""
+    given = values.astype(np.float64)
+    low, high, mean = (make(given, axis=(0, 1)) for make in (np.nanmin, np.nanmax, np.nanmean))
+    return Domain(low, high, mean, np.ones(len(low)))
 
 
 def least_squares(columns: NDArray, target: NDArray) -> NDArray:

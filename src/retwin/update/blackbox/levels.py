@@ -8,7 +8,6 @@ its uncertainty is that of a mean of autocorrelated samples.
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -17,15 +16,14 @@ from retwin.data.trajectories import Trajectories
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import Parameter
-from retwin.update.blackbox.estimate import WIDEST, BlackBox
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import correlation_time
+from retwin.update.dynamics.terms import WIDEST
 from retwin.update.dynamics.twin import DynamicsTwin
 
 
-def fit_levels(observed: Trajectories) -> BlackBox:
+def fit_levels(observed: Trajectories) -> DynamicsTwin:
     """The level of each output (d_y), with the variance of the samples about it."""
-    began = time.perf_counter()
     count = len(observed.outputs)
     values = np.where(observed.mask, observed.observed, np.nan).astype(float)
     level, noise = np.nanmean(values, axis=(0, 1)), np.nanvar(values, axis=(0, 1))
@@ -57,7 +55,7 @@ def fit_levels(observed: Trajectories) -> BlackBox:
     nothing, inputs = np.zeros(1), len(observed.inputs)
     low = np.concatenate([nothing, observed.commands.min(axis=(0, 1))]) if inputs else nothing
     domain = Domain(low, low, low, np.ones(1))
-    twin = DynamicsTwin(
+    return DynamicsTwin(
         equations,
         np.append(level, 0.0),
         np.concatenate([np.diag(deviation), np.zeros((1, count))]),
@@ -72,9 +70,3 @@ def fit_levels(observed: Trajectories) -> BlackBox:
         ("rest",),
         observed.emulated,
     )
-    figures = {
-        "order": 0.0,
-        "parameters": float(count),
-        "rms": float(np.sqrt(np.nanmean(residual**2))),
-    }
-    return BlackBox(twin, figures, time.perf_counter() - began)

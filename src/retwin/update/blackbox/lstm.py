@@ -7,7 +7,6 @@ simulated and saved as corrected twins are. It begins each simulation without a 
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +27,6 @@ def fit_lstm(
     observed: Trajectories, seed: int, progress: Progress | None, members: int | None = None
 ) -> BlackBox:
     """The network whose first weights are drawn with a seed; `members` makes it a smaller one."""
-    began = time.perf_counter()
     check_records(observed)
     constant, density = _constant(observed), SequenceMixture()
     if members is not None:
@@ -52,7 +50,7 @@ def fit_lstm(
         "rms": float(np.sqrt(np.mean(errors[observed.mask] ** 2))),
         "held_out": float(np.sqrt(np.mean((np.array(held_out) / unit) ** 2))),
     }
-    return BlackBox(CorrectedTwin(constant, residual), figures, time.perf_counter() - began)
+    return BlackBox(CorrectedTwin(constant, residual), figures)
 
 
 @torch.no_grad()

@@ -13,7 +13,6 @@ spatio-temporal domains" (2013), chapters 2 and 3.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,12 +28,12 @@ from retwin.update.blackbox.estimate import (
     BlackBoxFit,
     best_order,
     check_records,
-    coefficients_of,
     estimation_of,
     with_best_prior,
 )
 from retwin.update.blackbox.lags import ROWS_PER_TERM, Lags, least_squares
 from retwin.update.dynamics.estimation import Estimation, Point
+from retwin.update.dynamics.unknowns import coefficients_of
 
 DEGREE = 3
 """Highest degree of the monomials; it is lowered for many variables, see `Library`."""
@@ -62,15 +61,13 @@ def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> Bl
     Forward regression adds nonlinear terms to the linear ones, by the share of the variance that
     each explains beyond those before it. They have a Gaussian prior about 0.
     """
-    began = time.perf_counter()
     check_records(observed)
 
     def fit(order: int) -> BlackBoxFit | None:
         return Polynomial(Lags(observed, order, DEGREE)).fit()
 
     order, found = best_order(range(1, MAX_ORDER + 1), fit, progress)
-    names = [each.name for each in found.estimation.twin.states]
-    return found.model(order, began, names[: len(observed.outputs)])
+    return found.model(order, len(observed.outputs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +86,7 @@ class Polynomial:
     def twin(self, chosen: list[list[int]], coefficients: NDArray) -> StateTwin:
         """The model with some terms of each output; its states are the past samples."""
         lags, observed = self.lags, self.lags.observed
-        names, outputs = [each.name for each in lags.terms], lags.scales.outputs
+        names, outputs = [each.name for each in lags.terms], lags.outputs
         level, height = outputs.centre.tolist(), outputs.scale.tolist()
         width, past = len(observed.outputs), len(observed.outputs) * (lags.order - 1)
         inputs = len(observed.inputs)
@@ -172,7 +169,7 @@ class Polynomial:
         observed = self.lags.observed
         y = np.where(observed.mask, observed.observed, np.nan).astype(np.float64)
         speed = np.sqrt(np.nanmean(np.diff(y, axis=1) ** 2, axis=(0, 1)))
-        size = np.repeat(speed / self.lags.scales.outputs.scale, [len(own) for own in chosen])
+        size = np.repeat(speed / self.lags.outputs.scale, [len(own) for own in chosen])
         nonlinear = np.concatenate(chosen) > len(self.lags.domain.low)
         unknowns = replace(
             estimation.unknowns,

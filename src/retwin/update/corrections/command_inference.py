@@ -130,7 +130,7 @@ def infer_commands(
             break
         found, learned = expectation_maximisation(
             found,
-            learned.with_regression(problem) if regression else learned,
+            learned.with_regression(problem, regression),
             infer=infer,
             learn=learn,
             rounds=MAX_ROUNDS,
@@ -147,7 +147,7 @@ def infer_commands(
     made = _discrepancy(
         problem, likelihood.x, posterior, found.probability, learned, identified_below
     )
-    constant = learned.of_constant(problem)
+    constant = learned.with_regression(problem, False)
     design = constant.features.design(problem)
     draws = constant.hierarchy.draws(design, certain or likelihood)
     shown = machine(draws, problem.missed, problem.healthy, context.rate)
@@ -286,17 +286,14 @@ class Hyperparameters:
         solution = fitted(problem, prior, self.noise, fit.x).solution
         return Likelihood.of(solution, prior.gaussian)
 
-    def with_regression(self, problem: CommandProblem) -> Hyperparameters:
-        """The same to begin with, where offsets depend on direction, distance and pose."""
-        features = replace(self.features, regression=True)
-        adapted = self.hierarchy.adapted(features.design(problem))
-        return replace(self, features=features, hierarchy=adapted)
+    def with_regression(self, problem: CommandProblem, regression: bool) -> Hyperparameters:
+        """The same to begin with, where offsets depend on direction, distance and pose, or not.
 
-    def of_constant(self, problem: CommandProblem) -> Hyperparameters:
-        """The same to begin with, where offsets have a constant mean."""
-        if not self.features.regression:
+        Otherwise they have a constant mean.
+        """
+        if self.features.regression == regression:
             return self
-        features = replace(self.features, regression=False)
+        features = replace(self.features, regression=regression)
         adapted = self.hierarchy.adapted(features.design(problem))
         return replace(self, features=features, hierarchy=adapted)
 

@@ -257,11 +257,6 @@ class CommandProblem:
         """Values (n, P) or (n, P, …) by segment, (n, M, P / M, …)."""
         return x.unflatten(1, (self.missed.shape[1], -1))
 
-    @property
-    def unwhitened(self) -> CommandProblem:
-        """The same with residuals as they are."""
-        return replace(self, whitening=None)
-
     def learned_noise(
         self, noise: Noise, residual: Tensor, variance: Tensor | float = 0.0, floor: float = 1e-18
     ) -> Noise:

@@ -8,7 +8,7 @@ a long lever. Both variances are learned from the residual at rest, within segme
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from numpy.typing import NDArray
@@ -72,7 +72,7 @@ class SampleNoise:
         if not rest.any():
             return self
         weights = noise.weights(problem, problem.residual(x))[rest]
-        residual, gain = problem.unwhitened.residual(x)[rest], self.gain[rest]
+        residual, gain = replace(problem, whitening=None).residual(x)[rest], self.gain[rest]
         power = (weights[:, None] * residual.square()).mean().clamp_min(1e-30)
         lever = gain.square().sum(dim=1).mean(dim=0)
         # An actuator without any effect has no noise that could be seen.

@@ -29,7 +29,7 @@ from retwin.update.dynamics.network import TanhNetwork
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.terms import Term
 
-__all__ = ["CorrectedEquations", "correctable", "variable_names", "variables_of"]
+__all__ = ["CorrectedEquations", "correctable", "differentiate", "variable_names", "variables_of"]
 
 LINEAR = {"variable", "constant", "add", "sub", "neg"}
 """Operations of an equation that only defines a state."""
@@ -149,7 +149,7 @@ class CorrectedEquations:
         for equation in whole.equations:
             i, terms = equation.index, equation.terms
             own = columns[:, first : first + len(terms)]
-            basis = np.linalg.qr(_scaled(_by_parameters(twin, i, x, u) @ free))[0]
+            basis = np.linalg.qr(_scaled(differentiate(twin, i, (x, u))[1] @ free))[0]
             for column, term in zip(_scaled(own).T, terms, strict=True):
                 rest = column - basis @ (basis.T @ column)
                 rest -= basis @ (basis.T @ rest)
@@ -309,7 +309,7 @@ class CorrectedEquations:
     def _effects(self) -> NDArray:
         """An orthonormal basis (r, d_x, K) of the effects of the free parameters."""
         count = len(self.twin.states)
-        by_all = [_by_parameters(self.twin, i, *self.visited) @ self.free for i in range(count)]
+        by_all = [differentiate(self.twin, i, self.visited)[1] @ self.free for i in range(count)]
         columns = np.stack(by_all) / self.domain.speed[:, None, None]
         if not columns.shape[2]:
             return np.zeros((0, *columns.shape[:2]))
@@ -330,21 +330,36 @@ def _some(states: NDArray, commands: NDArray) -> tuple[NDArray, NDArray]:
     return x[some], u[some]
 
 
-def _by_parameters(twin: StateTwin, equation: int, states: NDArray, commands: NDArray) -> NDArray:
-    """Derivatives (K, q) of a state equation by the twin's parameters, at its present values."""
+def differentiate(
+    twin: StateTwin, equation: int, visited: tuple[NDArray, NDArray], values: NDArray | None = None
+) -> tuple[NDArray, NDArray]:
+    """A state equation (K,) and its derivatives (K, q) by the twin's parameters.
+
+    Parameters
+    ----------
+    twin : StateTwin
+        The twin.
+    equation : int
+        The index of the state.
+    visited : tuple of NDArray
+        States (K, d_x) and commands (K, d_u) where it is evaluated.
+    values : NDArray, optional
+        (q,), of the parameters, by default the present ones.
+
+    """
     import torch
 
-    x, u = (list(torch.tensor(each).unbind(1)) for each in (states, commands))
-    if not twin.parameters:
-        return np.zeros((len(states), 0))
-    values = twin.values(None, 1)[0, : len(twin.parameters)].tolist()
-    p = [torch.full_like(x[0], value, requires_grad=True) for value in values]
+    x, u = (list(torch.tensor(each).unbind(1)) for each in visited)
+    if values is None:
+        values = twin.values(None, 1)[0, : len(twin.parameters)]
+    zero = torch.zeros_like(x[0])
+    p = [torch.full_like(zero, value, requires_grad=True) for value in values.tolist()]
     slope = twin.model.evaluate("slope", x, u, p)[equation]
     if not slope.requires_grad:
-        return np.zeros((len(states), len(p)))
+        return slope.numpy(), np.zeros((len(zero), len(p)))
     found = torch.autograd.grad(slope.sum(), p, allow_unused=True)
-    zero = torch.zeros_like(x[0])
-    return torch.stack([zero if each is None else each for each in found], 1).numpy()
+    by_all = torch.stack([zero if each is None else each for each in found], 1).numpy()
+    return slope.detach().numpy(), by_all
 
 
 def _scaled(columns: NDArray) -> NDArray:

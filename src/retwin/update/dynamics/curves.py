@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from retwin.checks import one_of
 from retwin.twins.equations.state_twin import StateTwin
-from retwin.update.dynamics.corrected import variable_names, variables_of
+from retwin.update.dynamics.corrected import differentiate, variable_names, variables_of
 from retwin.update.dynamics.domain import EXTRAPOLATED, Domain
 
 __all__ = ["Curve", "axes_of", "curve_of"]
@@ -110,16 +109,8 @@ def curve_of(
     grid = np.linspace(low - beyond, high + beyond, POINTS)
     both = np.tile(domain.mean, (POINTS, 1))
     both[:, place] = grid
-    x, u = (torch.tensor(each) for each in np.split(both, [len(states)], axis=1))
-
-    def slope(p: list[torch.Tensor]) -> torch.Tensor:
-        return equations.model.evaluate("slope", list(x.unbind(1)), list(u.unbind(1)), p)[index]
-
-    p = [torch.full_like(x[:, 0], each, requires_grad=True) for each in values.tolist()]
-    after = slope(p)
-    found = torch.autograd.grad(after.sum(), p, allow_unused=True)
-    zero = torch.zeros_like(x[:, 0])
-    by_all = torch.stack([zero if each is None else each for each in found], 1).numpy()
+    x, u = np.split(both, [len(states)], axis=1)
+    after, by_all = differentiate(equations, index, (x, u), values)
     uncertain = by_all if relative_to is not None else by_all * learned
     unit = equations.states[index].unit
     return Curve(
@@ -130,7 +121,7 @@ def curve_of(
             unit if equations.step else f"{unit}/s",
         ),
         grid,
-        (after.detach() - slope([torch.full_like(zero, each) for each in before.tolist()])).numpy(),
+        after - differentiate(equations, index, (x, u), before)[0],
         np.linalg.norm(uncertain @ factor, axis=1),
         low,
         high,

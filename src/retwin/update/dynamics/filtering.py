@@ -7,11 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.data.trajectories import Trajectories
 from retwin.twins.equations.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.update.dynamics.domain import Domain
 
 STEP = 0.1
 """Differences of parameters, in posterior deviations, by which predictions are differentiated."""
+
+
+def arrays_of(record: Trajectories) -> tuple[NDArray, NDArray, NDArray]:
+    """Commands, outputs and whether these were measured, as `DynamicsFilter` takes them."""
+    commands = record.commands.astype(np.float64)
+    return commands, np.where(record.mask, record.observed, 0.0).astype(np.float64), record.mask
 
 
 @dataclass(frozen=True, eq=False)

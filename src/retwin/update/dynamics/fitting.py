@@ -34,12 +34,11 @@ from retwin.update.dynamics.noise import fit_noise, folds, widening
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
+from retwin.update.score_covariance import NORMAL_95
 from retwin.workers.threads import one_thread
 
 __all__ = ["FittedDynamics", "assembled", "fit_dynamics"]
 
-NORMAL_95 = 1.96
-"""Standard errors from an estimate to an end of its 95 % interval."""
 NONLINEAR = 1.5
 """Ratio of the errors of a simulation to those of a linear step, from which on the step is none."""
 

@@ -7,21 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from retwin.data.trajectories import Trajectories
 from retwin.update.dynamics.estimation import Estimation, correlation_time
+from retwin.update.dynamics.filtering import arrays_of
 from retwin.update.dynamics.linearised import HeldOut
 from retwin.update.dynamics.noise_search import CHANCE, SMALLEST, Search, noisy
 from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.forecast_errors import LEVEL, USUAL
 
 __all__ = ["edges", "fit_noise", "folds", "needed_factor", "widening"]
 
 CERTAIN = 1.645
 """Standard errors between a quantile of held-out samples and its upper 95 % limit."""
-LEVEL = 0.9
-"""Probability of the intervals that are calibrated."""
 ENOUGH = 10_000
 """Number of samples from which the likelihood is computed, unless one trajectory has more. They
 determine a variance to 1.4 %, and bands are scaled to all samples."""
@@ -74,7 +73,7 @@ def fit_noise(
         # A common scale changes no prediction, but all intervals.
         made = noisy(twin, indices, logs)
         error = np.abs(_predict(made, observed, parts, kept).standardised())
-        scale = (np.nanquantile(error, LEVEL) / ndtri((1 + LEVEL) / 2)) ** 2
+        scale = (np.nanquantile(error, LEVEL) / USUAL) ** 2
         return replace(
             made,
             process=scale * made.process,
@@ -96,11 +95,11 @@ def _predict(
     twin: DynamicsTwin, observed: Trajectories, parts: Sequence[NDArray], moves: NDArray
 ) -> Prediction:
     """One-step predictions of each part with the parameters that are estimated without it."""
-    commands = observed.commands.astype(np.float64)
-    measured = np.where(observed.mask, observed.observed, 0.0)
+    given = arrays_of(observed)
+    measured = given[1]
     mean, covariance = (np.zeros((*measured.shape, *more)) for more in ((), measured.shape[2:]))
     for part, move in zip(parts, moves, strict=True):
-        found = twin.filter(commands, measured, observed.mask, moves=move)
+        found = twin.filter(*given, moves=move)
         mean[part], covariance[part] = found[0][part], found[1][part]
     return Prediction(observed, mean, covariance, found[2])
 
@@ -167,12 +166,11 @@ def needed_factor(ratio: NDArray, seen: NDArray) -> float:
     little: below 1 it is the upper limit of the factor, from as many independent samples as the
     hits of the band are worth.
     """
-    usual = ndtri((1 + LEVEL) / 2)
-    factor = float(np.quantile(ratio[seen], LEVEL) / usual)
+    factor = float(np.quantile(ratio[seen], LEVEL) / USUAL)
     if factor >= 1:
         return factor
-    missed = ratio > factor * usual
+    missed = ratio > factor * USUAL
     around = np.where(seen, missed - missed[seen].mean(), 0.0)
     number = seen.sum() / correlation_time(around[..., None])
     level = LEVEL + CERTAIN * np.sqrt(LEVEL * (1 - LEVEL) / number)
-    return float(min(np.quantile(ratio[seen], min(level, 1.0)) / usual, 1.0))
+    return float(min(np.quantile(ratio[seen], min(level, 1.0)) / USUAL, 1.0))

@@ -19,6 +19,7 @@ from scipy.optimize import minimize
 from scipy.stats import wilcoxon
 
 from retwin.data.trajectories import Trajectories
+from retwin.update.dynamics.filtering import arrays_of
 from retwin.update.dynamics.prediction import Prediction, root_of, whitened
 from retwin.update.dynamics.twin import DynamicsTwin
 
@@ -121,10 +122,7 @@ class Search:
         first sample of a part are then those of other parameters.
         """
         made = noisy(self.twin, self.indices, logs)
-        commands, measured, seen = self._given
-        found = made.filter(
-            commands, measured, seen, changes=self._changes, simulated=self._simulated
-        )
+        found = made.filter(*self._given, changes=self._changes, simulated=self._simulated)
         prediction = Prediction(self.observed, *found)
         density = prediction.log_density()
         sums = np.array([density[part].sum() for part in self.parts])
@@ -137,12 +135,7 @@ class Search:
 
     @cached_property
     def _given(self) -> tuple[NDArray, NDArray, NDArray]:
-        seen = self.observed.mask
-        return (
-            self.observed.commands.astype(np.float64),
-            np.where(seen, self.observed.observed, 0.0),
-            seen,
-        )
+        return arrays_of(self.observed)
 
     @cached_property
     def _changes(self) -> NDArray:

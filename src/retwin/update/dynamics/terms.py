@@ -11,7 +11,7 @@ from retwin.twins.wrappers.parametric import Parameter
 __all__ = ["WIDEST", "Term", "allowed"]
 
 WIDEST = 1e9
-"""Bound of coefficients without one, which their prior keeps much smaller."""
+"""Bound of coefficients without one, which their prior or the samples keep much smaller."""
 
 
 @dataclass(frozen=True)

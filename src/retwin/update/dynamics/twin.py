@@ -13,13 +13,12 @@ import torch
 from numpy.typing import NDArray
 
 from retwin.checks import require
-from retwin.data.trajectories import Channels, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.equations.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.twins.faults.actuator_faults import Fault
-from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
-from retwin.twins.wrappers.wrapper import chunk_generator
+from retwin.twins.wrappers.wrapper import TwinWrapper, chunk_generator
 from retwin.update.dynamics.curves import Curve, axes_of, curve_of
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import Estimation, root
@@ -39,7 +38,7 @@ BEYOND = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class DynamicsTwin:
+class DynamicsTwin(TwinWrapper):
     """A twin with a learned discrepancy inside its state equations, and with noise.
 
         x[k+1] = F(x[k], u[k]; theta) + delta(x[k], u[k]; psi) + w[k],   y[k] = h(x[k]) + v[k]
@@ -99,31 +98,7 @@ class DynamicsTwin:
     case: str = ""
     forecast: ForecastErrors | None = None
     kind: ClassVar[str] = KIND
-
-    @property
-    def inputs(self) -> Channels:
-        """Command channels."""
-        return self.equations.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels."""
-        return self.equations.outputs
-
-    @property
-    def rate(self) -> float:
-        """Sample rate in Hz."""
-        return self.equations.rate
-
-    @property
-    def limits(self) -> Limits | None:
-        """Range of the commands."""
-        return self.equations.limits
-
-    @property
-    def shiftable(self) -> tuple[str, ...]:
-        """Parameters that can change during a simulation."""
-        return self.equations.shiftable
+    _field: ClassVar[str] = "equations"
 
     @property
     def filter(self) -> DynamicsFilter:

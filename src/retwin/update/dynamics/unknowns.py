@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,8 +12,9 @@ from scipy.linalg import block_diag
 from retwin.checks import require
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
+from retwin.update.dynamics.terms import WIDEST
 
-__all__ = ["Unknowns", "state_names", "state_twin_of", "unknowns_of"]
+__all__ = ["Unknowns", "coefficients_of", "state_names", "state_twin_of", "unknowns_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,3 +156,11 @@ def unknowns_of(base: StateTwin, free: Sequence[Parameter], values: dict[str, fl
         free=np.array(unknown, dtype=int),
         start_deviation=(ends[:, 1] - ends[:, 0]) / 2,
     )
+
+
+def coefficients_of(names: Iterable[str], values: NDArray) -> list[Parameter]:
+    """The free parameters of a model, which have no unit and hardly a bound."""
+    return [
+        Parameter(name, "1", -WIDEST, WIDEST, value)
+        for name, value in zip(names, values.ravel().tolist(), strict=True)
+    ]

@@ -25,7 +25,7 @@ from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.estimation import Estimation
 from retwin.update.dynamics.linearised import Point
-from retwin.update.dynamics.unknowns import Unknowns, state_twin_of
+from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
 
 RESOLUTION = 1e-3
 """Error of a sample, over the standard deviation of its output, to a hundredth of which the starts
@@ -105,21 +105,15 @@ class Windows:
     def _unknowns(self, twin: ParametricTwin) -> Unknowns:
         """The starts as unknowns, at the parameters of a twin, without any prior."""
         base, _, values = state_twin_of(twin)
-        parameters, free = len(base.parameters), np.flatnonzero(self.unknown)
-        given = np.array([values[name] for name in base.names])
+        free = np.flatnonzero(self.unknown)
         bounds = [
             (-np.inf, np.inf) if each.low is None else (each.low, each.high) for each in base.states
         ]
         low, high = np.array(bounds, dtype=float).T
-        return Unknowns(
-            names=(),
-            offset=given[:parameters],
-            matrix=np.zeros((parameters, 0)),
-            mean=np.zeros(0),
-            deviation=np.zeros(0),
+        return replace(
+            unknowns_of(base, (), values),
             low=low[free],
             high=high[free],
-            start=given[parameters:],
             free=free,
             start_deviation=np.full(len(free), np.inf),
         )
@@ -139,19 +133,19 @@ class Windows:
 
     @lru_cache(maxsize=1)  # noqa: B019 - the search asks for residuals, then for derivatives there
     def _at(self, theta: tuple[float, ...]) -> tuple[NDArray, NDArray, NDArray]:
-        """Starts (w, m), outputs (w, L, d_y) and derivatives by all parameters of `StateTwin`."""
+        """States (w, d_x) at the first samples, outputs (w, L, d_y), and their derivatives.
+
+        These are by all parameters of `StateTwin`.
+        """
         twin = self.twin.with_values(theta)
         own = replace(self._estimation, unknowns=self._unknowns(twin))
-        starts = self._search(own, self._present)
-        point = own.theta(Point(np.zeros(0), starts))
+        point = own.theta(Point(np.zeros(0), self._search(own, self._present)))
         outputs, slopes = own.twin.steps().sensitivities(own.commands, point)
-        return starts, outputs, slopes
+        return point[:, len(own.twin.parameters) :], outputs, slopes
 
     def starts(self, theta: NDArray) -> NDArray:
         """The states (w, d_x) at the first sample of each window, at parameters (k,)."""
-        own = replace(self._estimation, unknowns=self._unknowns(self.twin.with_values(theta)))
-        found = self._at(tuple(theta.tolist()))[0]
-        return own.theta(Point(np.zeros(0), found))[:, len(own.twin.parameters) :]
+        return self._at(tuple(theta.tolist()))[0]
 
     def with_starts(self, theta: NDArray) -> NDArray:
         """Parameters (k,) with those that are starts at the mean of what the trajectories have."""

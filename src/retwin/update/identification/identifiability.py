@@ -7,14 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.update.score_covariance import lag_one, score_covariance, variance_of
+from retwin.update.score_covariance import NORMAL_95, lag_one, score_covariance, variance_of
 
 RANK_TOLERANCE = 1e-5
 """Singular values below this share of the largest count as 0: finite differences are no better."""
 CHI2_95 = 3.84
 """95 % quantile of the chi-square distribution with one degree of freedom."""
-NORMAL_95 = 1.96
-"""Standard errors from an estimate to an end of its 95 % interval."""
 UNIFORM = 12**-0.5
 """Standard deviation of a uniform distribution between the bounds, in widths of the bounds."""
 AGREEMENT = 0.05

@@ -302,17 +302,13 @@ def _fit(
     once = distinct_records(np.where(misfit.seen, misfit.measured, np.nan))
     found, errors, agreeing = _identifiability(search, optima, point, residual, once)
     # Starts draw all parameters; one without effect has no other value than the present one.
-    kept = np.where(found.effects > 0, best.values, twin.values)
-    if (kept != best.values).any():
-        best = replace(best, values=tuple(kept.tolist()))
-        optima = [(best, point), *optima[1:]]
-    count = len(once)
-    half = stats.t.ppf(0.975, max(count - 1, 1)) * errors
-    values = np.array(best.values)
+    values = np.where(found.effects > 0, best.values, twin.values)
     if misfit.windows is not None:
         values = misfit.windows.with_starts(values)
-        best = replace(best, values=tuple(values.tolist()))
-        optima = [(best, point), *optima[1:]]
+    best = replace(best, values=tuple(values.tolist()))
+    optima = [(best, point), *optima[1:]]
+    count = len(once)
+    half = stats.t.ppf(0.975, max(count - 1, 1)) * errors
     unknown = ""
     if np.isnan(errors).any():
         alone = "" if count < MIN_TRAJECTORIES else ", of which one alone determines a parameter"

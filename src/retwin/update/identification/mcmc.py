@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import needs_extra, whole
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.update.identification.noise import Noise
 from retwin.update.identification.problem import BoxProblem
 from retwin.update.identification.search import LeastSquares, Search
@@ -73,9 +73,8 @@ class MCMC:
         # Its own generator, not numpy's global one: the chain is a function of the seed.
         begin.random_state = np.random.RandomState(rng.integers(2**31)).get_state()
         total = self.warm_up + self.steps
-        for done, _ in enumerate(sampler.sample(begin, iterations=total), 1):
-            if progress is not None:
-                progress(done / total)
+        for _ in tracked(sampler.sample(begin, iterations=total), total, progress):
+            pass
         chain = sampler.get_chain(discard=self.warm_up)
         # A short chain underestimates its autocorrelation time, so the minimum is conservative.
         slowest = float(np.max(emcee.autocorr.integrated_time(chain, tol=0)))

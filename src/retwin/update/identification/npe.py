@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import finite, needs_extra, positive, whole
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.update.identification.noise import Noise
 from retwin.update.identification.problem import BoxProblem
 from retwin.update.identification.summaries import Summaries
@@ -99,7 +99,7 @@ class NPE:
         box = problem.box
         points, paths = problem.prior
         seen = problem.misfit.seen
-        for done in range(self.rounds):
+        for done in tracked(range(self.rounds), self.rounds, progress):
             count = self.simulations if done else max(self.simulations - len(points), 0)
             if count:
                 fresh = box[0] + (box[1] - box[0]) * rng.random((count, problem.size))
@@ -115,8 +115,6 @@ class NPE:
             unit = (theta - box[0]) / (box[1] - box[0])
             samples, loss = self._posterior(unit, observed, measured, int(rng.integers(2**31)))
             drawn = box[0] + (box[1] - box[0]) * samples
-            if progress is not None:
-                progress((done + 1) / self.rounds)
             if done < self.rounds - 1:
                 ends = np.quantile(drawn, [self.tail, 1 - self.tail], axis=0)
                 margin = self.margin * (ends[1] - ends[0]) + 1e-6

@@ -12,7 +12,7 @@ from scipy.optimize import OptimizeResult, differential_evolution, least_squares
 from scipy.stats.qmc import LatinHypercube
 
 from retwin.checks import one_of, require, whole
-from retwin.progress import Progress
+from retwin.progress import Progress, part_of, tracked
 from retwin.twins.equations.interpolation import delays_tried
 from retwin.update.identification.misfit import Misfit
 
@@ -161,11 +161,8 @@ class Search:
         else:
             starts = self._evolve(now, rng)[None]
         robust = self.method.loss != "linear"
-        found = []
-        for done, start in enumerate(starts, 1):
-            found.append(self._search_from(start))
-            if self.progress is not None:
-                self.progress(done / len(starts) * (0.5 if robust else 1.0))
+        first, second = (part_of(self.progress, done, 1 + robust) for done in (0, 1))
+        found = [self._search_from(each) for each in tracked(starts, len(starts), first)]
         if robust:
             # All starts share one scale, so that their optima are comparable.
             best = min(found, key=lambda each: each.cost)
@@ -179,10 +176,7 @@ class Search:
                 got="outputs, measured and simulated, that never change and are equal",
                 remedy="give a record in which the system moves, and check its columns",
             )
-            for done, each in enumerate(found, 1):
-                found[done - 1] = self.descend(each.x)
-                if self.progress is not None:
-                    self.progress(0.5 + 0.5 * done / len(starts))
+            found = [self.descend(each.x) for each in tracked(found, len(starts), second)]
         optima = [self._optimum(*each) for each in zip(starts, found, strict=True)]
         return sorted(optima, key=lambda each: each[0].objective)
 

@@ -285,9 +285,9 @@ def _fit_per_segment(
         figures["delays_at_bound"] = share = float(found.at_bound.double()[valid].mean())
         result = replace(result, reason="; ".join(filter(None, [result.reason, bound_note(share)])))
     refinement = model.density.refinement
+    observed, mask = _measured(used)
+    sampled = sample_mask(model.correction, observed, mask, used.rate)
     if refinement is not None and len(held_out):
-        observed, mask = _measured(used)
-        sampled = sample_mask(model.correction, observed, mask, used.rate)
         fitted = np.setdiff1d(np.arange(len(used)), held_out)
         figures |= refine(
             model, context, observed, sampled, fitted=torch.as_tensor(fitted), held_out=held_out,
@@ -296,8 +296,6 @@ def _fit_per_segment(
     healthy = (context.faulty_commands == context.commands).flatten(1).all(dim=1)
     rows = (healthy & (context.frozen >= context.commands.shape[1]).all(dim=1)).nonzero().flatten()
     if len(rows):
-        observed, mask = _measured(used)
-        sampled = sample_mask(model.correction, observed, mask, used.rate)
         model.eval()
         figures |= coverage_figures(
             model, context[rows.numpy()], observed[rows], sampled[rows], seed=seed

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from retwin.checks import agree, given, instance, require
-from retwin.data.trajectories import Channels
+from retwin.twins.twin import Twin
 from retwin.update.corrections import CommandSpace, Correction, before_sensor
 from retwin.update.corrections.machines import OtherMachines
 from retwin.update.residual.loading import load_residual
@@ -26,20 +26,8 @@ Prior = Residual[Any] | Machine | str | Path
 Priors = Prior | Sequence[Prior]
 
 
-class System(Protocol):
-    """What has channels."""
-
-    @property
-    def inputs(self) -> Channels:
-        """Of the commands."""
-
-    @property
-    def outputs(self) -> Channels:
-        """Of the outputs."""
-
-
 def other_machines(
-    prior: Priors | None, correction: Correction, system: System
+    prior: Priors | None, correction: Correction, twin: Twin
 ) -> OtherMachines | None:
     """What models of other machines have learned of a kind; None without any.
 
@@ -72,9 +60,7 @@ def other_machines(
             remedy="leave it out",
         )
         remedy = f"leave {name} out: it is no machine of this kind"
-        agree(
-            "prior", model, system, "those of the twin", names=("inputs", "outputs"), remedy=remedy
-        )
+        agree("prior", model, twin, "those of the twin", names=("inputs", "outputs"), remedy=remedy)
         shown.append(
             given(
                 "prior",

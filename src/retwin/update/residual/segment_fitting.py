@@ -16,7 +16,7 @@ from torch import Tensor
 from retwin.nets.mixtures import BernoulliHead
 from retwin.nets.student import widening
 from retwin.nets.training import Fit, Training, train
-from retwin.progress import Progress
+from retwin.progress import Progress, part_of
 from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.penalties import BOUND_MARGIN, SMALLEST, checked_bounds, penalties
 from retwin.update.residual.targets import Targets
@@ -84,7 +84,7 @@ def fit_segments(
         every = torch.arange(len(parts.valid))
         rest = every[~torch.isin(every, held_out)]
         sets = parts[rest], parts[held_out]
-        fits.append(_trained(member, *sets, bounds, seed, _share(progress, k, runs)))
+        fits.append(_trained(member, *sets, bounds, seed, part_of(progress, k, runs)))
     with torch.no_grad():
         unseen = [(each, parts[fold]) for each, fold in zip(members, folds, strict=True)]
         spread = _spread(unseen)
@@ -92,7 +92,7 @@ def fit_segments(
     if len(folds) > 1:
         epochs = round(float(np.mean([fit.best_epoch for fit in fits])))
         how = replace(model.density.training, max_epochs=epochs)
-        last = _share(progress, len(folds), runs)
+        last = part_of(progress, len(folds), runs)
         refit = _trained(model, targets, None, bounds, seed, last, how)
         reason = f"{epochs} epochs, as many as were best on average in {len(folds)} folds"
         fits.append(replace(refit, reason=reason))
@@ -119,11 +119,6 @@ def _folds(count: int, seed: int) -> list[Tensor]:
     order = torch.as_tensor(np.random.default_rng(seed).permutation(count))
     size = max(1, round(0.2 * count))
     return list(order.split(size)[: -(-HELD_OUT // size)])
-
-
-def _share(progress: Progress | None, done: int, runs: int) -> Progress | None:
-    """The progress of one training among several."""
-    return None if progress is None else lambda part: progress((done + part) / runs)
 
 
 def _trained(

@@ -14,7 +14,7 @@ from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.nets.mixtures import Blocks
 from retwin.nets.training import Fit, Loss, isolated, train
-from retwin.progress import Progress
+from retwin.progress import Progress, part_of
 from retwin.update.corrections import Context, Correction, Discrepancy
 from retwin.update.residual.penalties import (
     BOUND_MARGIN,
@@ -101,22 +101,17 @@ def fit_sequence(
     _prepare(model, data, bounds, seed)
     fitted = torch.stack([identified & ~_dilate(part, density.margin) for part in held_out])
     rounds = 1 + density.refit
-    fit = _train_members(model, data, fitted, seed, _part(progress, 0, rounds))
+    fit = _train_members(model, data, fitted, seed, part_of(progress, 0, rounds))
     figures = _calibrate(model, data, held_out)
     if density.refit:
         with isolated(seed + 1):
             model.members = model.fresh()
         _initialise(model, data, seed)
         every = identified.expand_as(fitted)
-        fit = _train_members(model, data, every, seed + 1, _part(progress, 1, rounds))
+        fit = _train_members(model, data, every, seed + 1, part_of(progress, 1, rounds))
     model.emulated = used.emulated
     model.fitted = replace(fit, figures=figures, reason=f"{density.members} members, {fit.reason}")
     return model.eval()
-
-
-def _part(progress: Progress | None, done: int, rounds: int) -> Progress | None:
-    """The progress of one of several rounds."""
-    return progress and (lambda share: progress((done + share) / rounds))
 
 
 def _train_members(

@@ -5,6 +5,7 @@
 
 v are the commands and the parameters of the twin, in scaled units. All simulations of a twin begin
 at the same state, or at one that its parameters determine, which is 0 in suitable coordinates.
+A neural black box has the same equations without Y, from unknown starts.
 
 References
 ----------
@@ -30,6 +31,7 @@ from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.limits import Limits
 from retwin.twins.wrappers.parametric import Parameter
+from retwin.update.dynamics.unknowns import coefficients_of
 
 PAST = 10
 """Least number of past samples from which the first estimate of the states is made."""
@@ -37,8 +39,6 @@ STABLE = 0.999
 """Largest modulus of an eigenvalue of the linear part where it begins."""
 DISTINCT = 1e-10
 """Singular values, over the largest one, below which columns are combinations of others."""
-WIDEST = 1e9
-"""Bound of the weights, which their priors keep much smaller."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,8 @@ class Equations:
     Attributes
     ----------
     arrays : dict of str to NDArray
-        A, B, c, C, D, e, V, b, W and Y, in scaled units.
+        A, B, c, C, D, e, V, b, W and Y, in scaled units; without Y the network acts on the states
+        alone.
     speed : NDArray
         (d_x,), root mean square of the steps of the states, s.
     given, outputs : ChannelScale
@@ -145,12 +146,14 @@ class Equations:
         """The same equations with other weights (k,)."""
         return replace(self, arrays=self.at(flat))
 
-    def trainable(self, inputs: Channels, outputs: Channels, rate: float) -> StateTwin:
-        """The equations whose parameters are the weights, and whose inputs are v."""
-        weights = [
-            Parameter(f"w{i}", "1", -WIDEST, WIDEST, value)
-            for i, value in enumerate(self.flat.tolist())
-        ]
+    def trainable(
+        self, inputs: Channels, outputs: Channels, rate: float, states: Sequence[State] = ()
+    ) -> StateTwin:
+        """The equations whose parameters are the weights, and whose inputs are v.
+
+        Without `states`, all trajectories begin at 0.
+        """
+        names = [f"{name}{i + 1}" for name, each in self.arrays.items() for i in range(each.size)]
 
         def next_state(x: Any, u: Any, p: Any) -> Any:
             return self._next(list(x), list(u), self.at(torch.stack(list(p))))
@@ -159,7 +162,13 @@ class Equations:
             return self._output(list(x), list(u), self.at(torch.stack(list(p))))
 
         return StateTwin(
-            self._states(), output, inputs, outputs, rate, step=next_state, parameters=weights
+            states or self._states(),
+            output,
+            inputs,
+            outputs,
+            rate,
+            step=next_state,
+            parameters=coefficients_of(names, self.flat),
         )
 
     def twin(
@@ -207,7 +216,9 @@ class Equations:
 
     def _output(self, x: list[Any], v: list[Any], w: dict[str, Any]) -> tuple[Any, ...]:
         state, given, inside = self._inside(x, v, w)
-        made = w["C"] @ state + w["D"] @ given + w["e"] + w["Y"] @ inside
+        made = w["C"] @ state + w["D"] @ given + w["e"]
+        if "Y" in w:
+            made = made + w["Y"] @ inside
         return tuple(self.outputs.inverse(made).unbind())
 
     def _inside(self, x: list[Any], v: list[Any], w: dict[str, Any]) -> tuple[Any, Any, Any]:

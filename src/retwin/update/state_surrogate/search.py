@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.dynamics.estimation import Estimation
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.unknowns import unknowns_of
@@ -186,22 +187,17 @@ class StateSearch:
         unknowns = replace(unknowns, deviation=np.ones(unknowns.count))
         power = equations.outputs.deviation**2
         estimation = Estimation(twin, training, unknowns, training.mask, power)
-        tested = Estimation(twin, held_out, unknowns, held_out.mask, power)
-        own, other = (np.zeros((len(each), 0)) for each in (training, held_out))
         best, worse = Found(equations, np.inf), 0
-        now = estimation.linearised(Point(equations.flat, own))
+        now = estimation.linearised(Point(equations.flat, np.zeros((len(training), 0))))
         for _ in range(self.max_passes):
             if not now.finite:
                 break
             now = replace(estimation, variance=variance * power).minimised(now, steps)
-            shared = now.point.shared
-            residual = tested.residual(Point(shared, other))
-            error = float(
-                relative_error(residual, held_out.mask, equations.outputs.deviation).max()
-            )
+            tried = equations.with_weights(now.point.shared)
+            error = _error_of(tried, held_out, twin)
             worse = 0 if error < self.worth * best.error else worse + 1
             if error < best.error:
-                best = Found(equations.with_weights(shared), error)
+                best = Found(tried, error)
             if worse == self.patience or best.error < self.enough:
                 break
             variance = max(variance / self.ratio, self.weakest)
@@ -216,9 +212,12 @@ class StateSearch:
         return int(np.sum(size > self.component * size[0]))
 
 
-def _error_of(equations: Equations, made: Trajectories) -> float:
-    """The largest relative error of an output in simulations."""
-    twin = equations.trainable(made.inputs, made.outputs, made.rate)
+def _error_of(equations: Equations, made: Trajectories, twin: StateTwin | None = None) -> float:
+    """The largest relative error of an output in simulations; `twin` is `trainable` if it is known.
+
+    Its present weights do not matter.
+    """
+    twin = twin or equations.trainable(made.inputs, made.outputs, made.rate)
     theta = np.tile(np.append(equations.flat, np.zeros(len(twin.states))), (len(made), 1))
     simulated = twin.steps().run(made.commands.astype(np.float64), theta)[0]
     deviation = equations.outputs.deviation
