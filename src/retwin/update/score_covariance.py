@@ -21,9 +21,10 @@ MAX_AUTOCORRELATION = 0.999
 def score_covariance(score: NDArray, residual: NDArray, measured: int) -> tuple[NDArray, NDArray]:
     """The covariance of sums of residuals that directions weight, and its degrees of freedom.
 
-    Residuals are an autoregression of first order, as their lag-one autocorrelation says, or
-    correlated in any way within blocks of time and independent between them, whichever gives the
-    wider interval: what a wrong twin leaves is slower than its steps from sample to sample.
+    Residuals of each output are an autoregression of first order, as their variance and lag-one
+    autocorrelation say, or correlated in any way within blocks of time and independent between
+    them, whichever gives the wider interval: what a wrong twin leaves is slower than its steps from
+    sample to sample.
 
     Parameters
     ----------
@@ -48,14 +49,17 @@ def score_covariance(score: NDArray, residual: NDArray, measured: int) -> tuple[
 
     """
     size = score.shape[-1]
-    memory = lag_one(residual)
-    after = lfilter([1.0], [1.0, -memory], score, axis=1)
-    before = lfilter([1.0], [1.0, -memory], score[:, ::-1], axis=1)[:, ::-1]
-    flat = score.reshape(-1, size)
-    effect = flat.T @ (after + before - score).reshape(-1, size)
-    variance = variance_of(residual, measured, size)
-    covariance = variance * 0.5 * (effect + effect.T)
-    plain = np.maximum(np.diag(flat.T @ flat), 1e-300)
+    effect, plain = np.zeros((size, size)), np.full(size, 1e-300)
+    for own, rest in zip(np.moveaxis(score, 2, 0), np.moveaxis(residual, 2, 0), strict=True):
+        seen = np.count_nonzero(rest)  # outputs differ in noise, and in how it depends on time
+        variance = float(np.sum(rest**2)) / max(seen * (1 - size / measured), 1.0)
+        memory = lag_one(rest[..., None])
+        after = lfilter([1.0], [1.0, -memory], own, axis=1)
+        before = lfilter([1.0], [1.0, -memory], own[:, ::-1], axis=1)[:, ::-1]
+        flat, by_others = own.reshape(-1, size), (after + before - own).reshape(-1, size)
+        effect += variance * flat.T @ by_others
+        plain += variance * np.sum(flat**2, axis=0)
+    covariance = 0.5 * (effect + effect.T)
     freedom = np.maximum(measured / np.maximum(np.diag(effect) / plain, 1e-300) - size, 1.0)
     block = blocks_of(residual)
     number = int(block.max()) + 1

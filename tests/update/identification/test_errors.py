@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 from toys import AFFINE, commands
 
 import retwin as rt
+from retwin.twins import Parameter, ParametricTwin
 from retwin.update.identification import LeastSquares, identify
 from retwin.update.identification.identifiability import (
     Identifiability,
@@ -99,3 +100,35 @@ def test_copies_of_a_trajectory_count_once() -> None:
     errors = [each.identifiability.errors for each in (six, alone)]
     assert errors[0] == pytest.approx(errors[1], rel=1e-3)
     assert np.isnan(list(six.errors.values())).all()
+
+
+@pytest.mark.parametrize("records", [1, 6])
+def test_outputs_of_unequal_noise_have_errors_of_their_own(records: int) -> None:
+    """Under a robust loss, most samples of the noisier output count as outliers."""
+    inputs, outputs = rt.Channels(("u",), ("V",)), rt.Channels(("y1", "y2"), ("m", "K"))
+
+    def build(v: dict[str, float]) -> rt.FunctionTwin:
+        gains = np.array([v["a"], v["b"]])
+        return rt.FunctionTwin(lambda u: u * gains, inputs, outputs, rate=1.0)
+
+    free = [Parameter("a", "m/V", 0.1, 5.0), Parameter("b", "K/V", 0.1, 5.0)]
+    twin, found = ParametricTwin.built(build, free), []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        u = rng.normal(size=(records, 1200 // records, 1))
+        noise = rng.normal(size=(*u.shape[:2], 2)) * [0.02, 0.2]
+        observed = u * [2.0, 1.0] + noise
+        record = rt.Trajectories(
+            commands=u, nominal=0 * observed, observed=observed, rate=1.0,
+            inputs=inputs, outputs=outputs,
+        )  # fmt: skip
+        it = rt.identify(twin, record, LeastSquares(starts=1), seed=0)
+        local = it.identifiability
+        half = stats.t.ppf(0.975, local.freedom) * local.errors
+        if records > 2:
+            half = np.array([np.ptp(it.intervals[name]) / 2 for name in ("a", "b")])
+        found.append([*it.values.values(), *half])
+    values, halves = np.array(found)[:, :2], np.array(found)[:, 2:]
+    inside = np.abs(values - [2.0, 1.0]) <= halves
+    assert (inside.mean(axis=0) >= 0.85).all()
+    assert (np.median(halves, axis=0) < 4 * values.std(axis=0)).all()

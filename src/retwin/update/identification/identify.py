@@ -352,12 +352,18 @@ def _identifiability(
     """
     misfit = search.misfit
     # Outliers have as little weight in the standard errors as they had in the optimum.
-    _, residual, curvature = search.linearised(residual)
+    _, gradient, curvature = search.linearised(residual)
     jacobian, width = search.jacobian(best).reshape(*residual.shape, -1), misfit.high - misfit.low
+    # As least squares: near the optimum, losses are squares of residuals that have these weights.
+    weight = np.sqrt(curvature)[once]
+    errors = width * standard_errors(jacobian[once] * weight[..., None], gradient[once] / weight)
+    # Where noise is to be the same in all samples of an output, their weights must be so.
+    weight = np.sqrt(search.averaged(curvature))
+    jacobian, residual = jacobian * weight[..., None], gradient / weight
     jacobian, residual, seen = jacobian[once], residual[once], misfit.seen[once]
     # As well as the best: within the 95 % range of the objective under noise (chi-square).
     measured, lowest = int(seen.sum()), optima[0][0].objective ** 2
-    margin = CHI2_95 * curvature * noise_of(residual, measured, len(best)) + 1e-6 * lowest
+    margin = CHI2_95 * noise_of(residual, measured, len(best)) + 1e-6 * lowest
     alternatives = [point for each, point in optima if each.objective**2 <= lowest + margin]
     found = identifiability(
         misfit.twin.names,
@@ -368,4 +374,4 @@ def _identifiability(
         at_bound=(best <= AT_BOUND) | (best >= 1 - AT_BOUND),
         alternatives=np.array(alternatives) - best,
     )
-    return found, width * standard_errors(jacobian, residual), len(alternatives)
+    return found, errors, len(alternatives)

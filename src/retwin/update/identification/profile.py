@@ -113,8 +113,9 @@ def profile(
         low, high = max(best[which] - distance, 0.0), min(best[which] + distance, 1.0)
         grid = np.unique(np.append(np.linspace(low, high, points), best[which]))
         sums = _profile_sums(search, which, grid, best)
-        _, residual, curvature = search.linearised(misfit.residuals(search.theta(best[None]))[0])
-        noise = curvature * variance_of(residual, int(misfit.seen.sum()), len(names))
+        _, gradient, curvature = search.linearised(misfit.residuals(search.theta(best[None]))[0])
+        residual = gradient / np.sqrt(search.averaged(curvature))
+        noise = variance_of(residual, int(misfit.seen.sum()), len(names))
         noise *= (error / local.white[which]) ** 2 if np.isfinite(error) else 1.0
     return Profile(
         name,

@@ -26,7 +26,7 @@ FAILED = 1e3
 AT_BOUND = 1e-3
 """Distance from a bound that counts as on it, in widths of the bounds."""
 MIN_CURVATURE = 0.05
-"""Smallest mean curvature of a robust loss, which is negative where most residuals are outliers."""
+"""Smallest mean curvature of a loss, which is negative where most residuals are outliers."""
 POLISH = 60
 """Largest number of trial steps after a global search."""
 Loss = Literal["linear", "soft_l1", "cauchy"]
@@ -292,11 +292,11 @@ class Search:
         found.fun, found.cost = found.fun * unit, found.cost * unit**2
         return found
 
-    def linearised(self, residual: NDArray) -> tuple[float, NDArray, float]:
-        """The sum of losses, equivalent residuals for least squares, and the mean curvature.
+    def linearised(self, residual: NDArray) -> tuple[float, NDArray, NDArray]:
+        """The sum of losses of residuals (n, P, d_y), half its gradient by them, and curvature.
 
-        To first order the optimum depends on data as that of least squares with the equivalent
-        residuals. Near it the loss grows as the squares times the curvature.
+        Samples with larger noise than others, such as those of another output, have less of both.
+        The curvature of "cauchy" may be negative, so that it is averaged over each output.
 
         References
         ----------
@@ -309,11 +309,17 @@ class Search:
             total, gradient, curvature = 2 * np.sum(root - 1), residual / root, root**-3
         elif self.loss == "cauchy":
             total, gradient = np.sum(np.log1p(square)), residual / (1 + square)
-            curvature = (1 - square) / (1 + square) ** 2
+            curvature = self.averaged((1 - square) / (1 + square) ** 2)
         else:
-            return float(np.sum(residual**2)), residual, 1.0
-        mean = max(float(np.mean(curvature[self.misfit.seen])), MIN_CURVATURE)
-        return float(self.scale**2 * total), gradient / mean, mean
+            return float(np.sum(residual**2)), residual, np.ones_like(residual)
+        return float(self.scale**2 * total), gradient, curvature
+
+    def averaged(self, curvature: NDArray) -> NDArray:
+        """The mean curvature over the samples of each output, in the place of each (n, P, d_y)."""
+        seen = np.broadcast_to(self.misfit.seen, curvature.shape)
+        count = np.maximum(seen.sum(axis=(0, 1)), 1)
+        mean = np.sum(curvature, axis=(0, 1), where=seen) / count
+        return np.broadcast_to(np.maximum(mean, MIN_CURVATURE), curvature.shape)
 
     def _optimum(self, start: NDArray, found: OptimizeResult) -> tuple[Optimum, NDArray]:
         begin, end = self.theta(np.stack([start, found.x]))
