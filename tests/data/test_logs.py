@@ -677,6 +677,26 @@ def test_a_command_of_another_unit_is_not_taken_for_the_one_that_is_left(tmp_pat
     assert propose_mapping(tmp_path / "run.csv", case=twin).open_channels == ("voltage",)
 
 
+def test_a_unit_that_one_signal_alone_has_is_a_guess_at_its_channel(tmp_path: Path) -> None:
+    """Names of tags are like no channel; two temperatures are not told apart by their unit."""
+    rows = [f"{t},{t % 7},{t % 5},{t % 3},{t % 2},{t % 4}" for t in range(50)]
+    head = "time,FIC1.PV [m3/h],EH1.OUT [%],TT1.PV [degC],TT2.PV [°C],P1.SP [bar]"
+    (tmp_path / "run.csv").write_text("\n".join([head, *rows]))
+    units = ("%", "l/min"), ("degC", "K", "kPa", "1")
+    twin = TwinData(
+        rt.Channels(("heater", "flow"), units[0]),
+        rt.Channels(("low", "up", "press", "share"), units[1]),
+    )
+    found = propose_mapping(tmp_path / "run.csv", case=twin)
+    assert found.channels == {"FIC1.PV": "flow", "EH1.OUT": "heater"}
+    assert found.by_unit == ("heater", "flow")
+    # A set point is no output, even where its unit fits.
+    assert found.open_channels == ("low", "up", "press", "share")
+    assert found.text.count("# a guess by its unit") == 2
+    assert 'from_unit = "…" # if the log states none' in found.text
+    assert "the log states none: taken as" not in found.text, "it states all of them"
+
+
 @pytest.mark.slow
 def test_a_channel_without_a_signal_stays_open(tmp_path: Path) -> None:
     at = np.arange(0, 5, 0.01)

@@ -53,7 +53,7 @@ RULES = tuple(
         (r"(?<![^\W\d_])([µucdkm]?m|in|ft|s|min|h|K)(-?[1-4])(?!\w)", r"\1^\2"),
     )
 )
-"""Patterns of spellings within a unit, and how pint spells them: `kg/cm2`, `W/(m2 °C)`, `bar(g)`."""
+"""Patterns of spellings within a unit, as in `W/(m2 °C)` and `bar(g)`, and how pint spells them."""
 DEFINITIONS = (
     "newton_meter = newton * meter = Nm",
     "reactive_volt_ampere = volt * ampere = var = VAr",
