@@ -157,6 +157,7 @@ def test_models_without_the_twin_are_compared_on_the_same_parts(tmp_path: Path) 
     assert any("the twin lacks something" in each for each in found.remarks)
     page = fit_page(found, "model", title="heater")
     assert page.count("without the twin") > len(rivals)
+    assert "retwin monitor fit model " in page
     known = rt.fit(twin_of(), records(0, slope=right), rt.Choice(candidates=FAST))
     assert not any("lacks something" in each for each in with_yardstick(known).remarks)
 

@@ -100,8 +100,9 @@ def identify(
 ) -> None:
     """Identify the parameters of your twin from logs.
 
-    Writes report.html, identification.json and a case, updated.toml. A module
-    that is named by the twin or its case is run with your rights.
+    Writes report.html, identification.json, the measurements as logs.npz, and a
+    case, updated.toml. A module that is named by the twin or its case is run
+    with your rights.
     """
     from retwin.cases import LogReader
     from retwin.deploy.identified import HOLDS, save_identification
@@ -282,6 +283,5 @@ def _print(
     )
     if values["updated_case"]:
         note(f"No updated.toml: {values['updated_case']}")
-    for name in ("report.html", "identification.json", "updated.toml", "start_values.json"):
-        if name in values["files"]:
-            note(f"Saved {values['files'][name]}")
+    for path in values["files"].values():
+        note(f"Saved {path}")
