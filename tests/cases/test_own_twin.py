@@ -33,6 +33,12 @@ def test_the_page_shows_the_files_of_the_example() -> None:
     assert sum(bool(line.strip()) for line in (module + case).splitlines()) <= 50
 
 
+def test_what_happens_in_the_last_run_of_the_heater_is_said_alike() -> None:
+    for place in ("README.md", "docs/own_twin.md", "examples/heater/measure.py"):
+        text = (ROOT / place).read_text("utf-8")
+        assert "In `run6.csv` the heater loses half of its power after 600 s" in text, place
+
+
 def write_record(file: Path, case: rt.Case) -> None:
     """A record in the benchmark's layout, made by the example's own function with other numbers."""
     sampler = replace(case.sampler, duration=4096.0)
