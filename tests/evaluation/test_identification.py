@@ -213,7 +213,7 @@ def test_residuals_of_a_right_twin_are_white_and_of_a_wrong_one_follow_the_comma
 
 
 def test_what_says_that_a_log_shows_nothing_follows_the_errors() -> None:
-    """Of two parameters at their bounds and a fit like the mean's, the records are to be checked."""
+    """Where two parameters are at bounds and the mean fits as well, records are to be checked."""
     data = measured(4, steps=200)
     with pytest.warns(UserWarning, match="at a bound: gain, leak"):
         found = checked(data.replace(observed=-1000 * data.observed), "gain", "leak")
