@@ -3,7 +3,7 @@
     python measure.py [FOLDER]
 
 The emulated heater also radiates, its resistor warms up before its block does, and its sensor has
-noise and steps of 0.1 degC. In `run6.csv` a fan begins to blow after half of the time.
+noise and steps of 0.1 degC. In `run6.csv` the heater loses half of its power after 600 s.
 """
 
 import csv

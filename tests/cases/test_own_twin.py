@@ -8,6 +8,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -25,12 +26,35 @@ def shown(language: str) -> list[str]:
 
 
 def test_the_page_shows_the_files_of_the_example() -> None:
-    heater, module, _ = shown("python")
+    heater, _, module, _ = shown("python")
     assert heater == (EXAMPLE.parent / "heater" / "heater.py").read_text("utf-8")
     (case,) = shown("toml")
     assert module == (EXAMPLE / "two_tanks.py").read_text("utf-8")
     assert case == (EXAMPLE / "case.toml").read_text("utf-8")
     assert sum(bool(line.strip()) for line in (module + case).splitlines()) <= 50
+
+
+def test_a_function_of_one_run_becomes_a_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant, names = ModuleType("plant"), {}
+    vars(plant)["tank"] = lambda heater, flow, power, loss: np.stack(
+        [power * heater, loss * flow], axis=1
+    )
+    monkeypatch.setitem(sys.modules, "plant", plant)
+    exec(compile(shown("python")[1], "own_twin.md", "exec"), names)
+    commands = np.random.default_rng(0).normal(size=(3, 20, 2))
+    twin = rt.FunctionTwin(
+        names["twin"],
+        rt.Channels(("heater", "flow"), ("%", "l/min")),
+        rt.Channels(("low", "up"), ("degC", "degC")),
+        0.2,
+    )
+    np.testing.assert_allclose(twin.simulate(commands, seed=0).observed, commands * [3000, 5])
+
+
+def test_what_happens_in_the_last_run_of_the_heater_is_said_alike() -> None:
+    for place in ("README.md", "docs/own_twin.md", "examples/heater/measure.py"):
+        text = (ROOT / place).read_text("utf-8")
+        assert "In `run6.csv` the heater loses half of its power after 600 s" in text, place
 
 
 def write_record(file: Path, case: rt.Case) -> None:
@@ -61,7 +85,7 @@ def test_the_code_of_the_page_runs(
         write_record(tmp_path / "dataBenchmark.csv", rt.cases.get("case.toml"))
     names: dict[str, Any] = {}
     try:
-        exec(compile(shown("python")[2], "own_twin.md", "exec"), names)
+        exec(compile(shown("python")[3], "own_twin.md", "exec"), names)
     finally:
         sys.modules.pop("two_tanks", None)
     print(printed := capsys.readouterr().out)

@@ -239,6 +239,25 @@ def test_a_value_at_its_bound_has_no_error(place: Path, call) -> None:
     assert "gain lies at its upper bound, 0.11" in out
 
 
+def test_what_invalidates_a_result_comes_first_and_each_file_is_named(place: Path, call) -> None:
+    """Commands that never change, and a level that follows no gain of the twin."""
+    level = np.cumsum(np.random.default_rng(1).normal(size=100))
+    write(place / "flat.csv", valve=np.full(100, 0.5), level=level)
+    code, out, err = call("identify", "tank.toml", "flat.csv", "--out", "out")
+    assert code == 0
+    table, rest = out.split("RMS error", 1)
+    assert "±" not in table, "the interval alone"
+    assert "physical values may lie outside" in table
+    errors, first, *_ = rest.split("\n\n")[1].splitlines()
+    assert "the RMS error of level" in errors
+    assert first.startswith("valve: constant in all logs")
+    assert out.count("constant in all logs") == 1
+    page = Path("out/report.html").read_text("utf-8")
+    assert page.index("valve: constant in all logs") < page.index("not white noise (Ljung")
+    assert page.count("physical values may lie outside") == 1
+    assert "Saved out/logs.npz" in err
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -310,6 +310,38 @@ def test_units_offsets_and_clocks() -> None:
     assert not compatible("V", "nonsense")
 
 
+@pytest.mark.parametrize(
+    ("source", "target", "value"),
+    [
+        *[("m3/h", "l/min", 1000 / 60), ("m³/h", "m3/s", 1 / 3600), ("lpm", "l/min", 1.0)],
+        *[("Nm3/h", "Nl/min", 1000 / 60), ("Nm³/h", "Nm3/h", 1.0), ("kg/m3", "g/l", 1.0)],
+        *[
+            ("℃", "°C", 1.0),
+            ("deg C", "degC", 1.0),
+            ("DEGC", "K", 274.15),
+            ("W/(m2 °C)", "W/(m2 K)", 1.0),
+        ],
+        *[("bar(g)", "kPa(g)", 100.0), ("psig", "barg", 0.0689476), ("bar(a)", "kPa", 100.0)],
+        *[("kNm", "N m", 1000.0), ("m s-1", "km/h", 3.6), ("m/s2", "m/s^2", 1.0)],
+        *[("RPM", "1/min", 1.0), ("pct", "%", 1.0), ("kvar", "var", 1000.0)],
+    ],
+)
+def test_units_are_read_as_plants_spell_them(source: str, target: str, value: float) -> None:
+    assert converted(np.ones(1), source, target, "")[0] == pytest.approx(value, rel=1e-5)
+    assert compatible(source, target)
+
+
+@pytest.mark.parametrize(
+    ("source", "target"), [("Nm3/h", "m3/h"), ("Sm3", "Nm3"), ("bar(g)", "bar"), ("Nm2", "m2")]
+)
+def test_what_a_unit_does_not_determine_is_not_converted(source: str, target: str) -> None:
+    """A normal volume is an amount of gas, and a gauge pressure is one above that of the air."""
+    assert not compatible(source, target)
+    remedy = r"set from_unit = … or a factor, scale = …, .* mapping file, which retwin data map"
+    with pytest.raises(InputError, match=remedy):
+        converted(np.ones(1), source, target, "a log")
+
+
 @pytest.mark.slow
 def test_nothing_is_left_in_the_folder_of_temporary_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -645,6 +677,26 @@ def test_a_command_of_another_unit_is_not_taken_for_the_one_that_is_left(tmp_pat
     assert propose_mapping(tmp_path / "run.csv", case=twin).open_channels == ("voltage",)
 
 
+def test_a_unit_that_one_signal_alone_has_is_a_guess_at_its_channel(tmp_path: Path) -> None:
+    """Names of tags are like no channel; two temperatures are not told apart by their unit."""
+    rows = [f"{t},{t % 7},{t % 5},{t % 3},{t % 2},{t % 4}" for t in range(50)]
+    head = "time,FIC1.PV [m3/h],EH1.OUT [%],TT1.PV [degC],TT2.PV [°C],P1.SP [bar]"
+    (tmp_path / "run.csv").write_text("\n".join([head, *rows]))
+    units = ("%", "l/min"), ("degC", "K", "kPa", "1")
+    twin = TwinData(
+        rt.Channels(("heater", "flow"), units[0]),
+        rt.Channels(("low", "up", "press", "share"), units[1]),
+    )
+    found = propose_mapping(tmp_path / "run.csv", case=twin)
+    assert found.channels == {"FIC1.PV": "flow", "EH1.OUT": "heater"}
+    assert found.by_unit == ("heater", "flow")
+    # A set point is no output, even where its unit fits.
+    assert found.open_channels == ("low", "up", "press", "share")
+    assert found.text.count("# a guess by its unit") == 2
+    assert 'from_unit = "…" # if the log states none' in found.text
+    assert "the log states none: taken as" not in found.text, "it states all of them"
+
+
 @pytest.mark.slow
 def test_a_channel_without_a_signal_stays_open(tmp_path: Path) -> None:
     at = np.arange(0, 5, 0.01)
@@ -663,6 +715,7 @@ def test_names_and_units_of_titles() -> None:
         ("v (m/s)", ("v", "m/s")),
         ("f(x)", ("f(x)", "")),
         ("q[3]", ("q[3]", "")),
+        ("P1 [bar(g)]", ("P1", "bar(g)")),
         ("speed", ("speed", "")),
     ):
         assert named_unit(title) == expected

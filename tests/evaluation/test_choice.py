@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 import retwin as rt
-from retwin.evaluation import predict_records
+from retwin.cli.models import _verdict
+from retwin.evaluation import ModelScore, predict_records
 from retwin.evaluation.choice.comparison import Comparison, Predicted
 from retwin.evaluation.choice.fitting import with_yardstick
 from retwin.evaluation.choice.folds import Fold, block_means, folds_of
@@ -157,6 +158,7 @@ def test_models_without_the_twin_are_compared_on_the_same_parts(tmp_path: Path) 
     assert any("the twin lacks something" in each for each in found.remarks)
     page = fit_page(found, "model", title="heater")
     assert page.count("without the twin") > len(rivals)
+    assert "retwin monitor fit model " in page
     known = rt.fit(twin_of(), records(0, slope=right), rt.Choice(candidates=FAST))
     assert not any("lacks something" in each for each in with_yardstick(known).remarks)
 
@@ -357,3 +359,15 @@ def test_stationary_noise_has_the_spread_and_the_persistence_of_the_errors() -> 
     mean, deviation = free_moments(model, power)
     np.testing.assert_allclose(mean, nominal, atol=1e-6)
     np.testing.assert_allclose(deviation, float(residual.scale), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("horizon", "sample"), [(None, "first"), (1.0, "last measured")])
+def test_a_sample_that_predicts_better_is_named_as_what_it_is(
+    horizon: float | None, sample: str
+) -> None:
+    """In free simulation it is the first of the record, else the last one before the horizon."""
+    scores = [
+        ModelScore(who, "y", horizon, rmse, rmse, float("nan"), float("nan"))
+        for who, rmse in (("model", 2.0), ("hold", 1.0))
+    ]
+    assert _verdict(scores) == [f"y: the {sample} sample is a better prediction."]

@@ -12,9 +12,10 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 import retwin as rt
+from retwin.cases.measured import CONSTANT
 from retwin.evaluation import hold_out, validate_identification
 from retwin.evaluation.identification.parameters import estimates
-from retwin.report.identification.texts import findings, state
+from retwin.report.identification.texts import findings, interval_remark, state
 from retwin.update.identification import MCMC, LeastSquares, Noise
 
 LEAK, GAIN = 0.1, 0.5
@@ -201,11 +202,28 @@ def test_residuals_of_a_right_twin_are_white_and_of_a_wrong_one_follow_the_comma
     (test,) = right.residuals
     assert test.p_white > 1e-3
     assert test.inputs[0].p_value > 1e-3
+    assert not interval_remark(right)
     data = measured(4, steps=4000, noise=0.05)
     slow = lfilter([0.1], [1, -0.9], data.observed, axis=1)  # a second lag, which the twin lacks
-    (test,) = checked(data.replace(observed=slow), "gain").residuals
+    wrong = checked(data.replace(observed=slow), "gain")
+    (test,) = wrong.residuals
     assert test.p_white < 1e-6
     assert test.inputs[0].p_value < 1e-3
+    assert "physical values may lie outside" in interval_remark(wrong)
+
+
+def test_what_says_that_a_log_shows_nothing_follows_the_errors() -> None:
+    """Where two parameters are at bounds and the mean fits as well, records are to be checked."""
+    data = measured(4, steps=200)
+    with pytest.warns(UserWarning, match="at a bound: gain, leak"):
+        found = checked(data.replace(observed=-1000 * data.observed), "gain", "leak")
+    assert len(found.at_bound) == 2
+    note = f"u: {CONSTANT}"
+    error, *texts = findings(found, ["a.csv: times in column t.", note])
+    assert "the RMS error of y" in error
+    assert texts[0] == note
+    assert texts[1].endswith("check units and columns.")
+    assert not any("times in column" in each for each in texts)
 
 
 def test_exact_measurements_give_no_test_and_no_warning() -> None:

@@ -8,6 +8,9 @@ from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 
+CONSTANT = "constant in all logs, so that they show no dynamics of it."
+"""What is noted of channels that never change."""
+
 
 def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -> Trajectories:
     """The healthy and the unlabelled trajectories, without their outputs in the first seconds.
@@ -37,7 +40,7 @@ def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -
         notes[f"No log holds {lacking}."] = []
     constant = ", ".join(_constant(joined))
     if constant:
-        notes[f"{constant}: constant in all logs, so that they show no dynamics of it."] = []
+        notes[f"{constant}: {CONSTANT}"] = []
     return joined
 
 

@@ -134,6 +134,7 @@ def map_log(
             "signals": [asdict(each) for each in made.facts],
             "channels": made.channels,
             "open": made.open_channels,
+            "by_unit": made.by_unit,
             "notes": remarks,
         },
         _seen(made),
@@ -143,6 +144,8 @@ def map_log(
     if made.open_channels:
         lacking = ", ".join(made.open_channels)
         note(f"No signal that changes was found for {lacking}: name it in {out}")
+    if made.by_unit:
+        note(f"Guessed by the unit alone, to be checked: {', '.join(made.by_unit)}")
     for each in remarks:
         note(each)
     if case is None:

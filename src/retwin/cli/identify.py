@@ -100,8 +100,9 @@ def identify(
 ) -> None:
     """Identify the parameters of your twin from logs.
 
-    Writes report.html, identification.json and a case, updated.toml. A module
-    that is named by the twin or its case is run with your rights.
+    Writes report.html, identification.json, the measurements as logs.npz, and a
+    case, updated.toml. A module that is named by the twin or its case is run
+    with your rights.
     """
     from retwin.cases import LogReader
     from retwin.deploy.identified import HOLDS, save_identification
@@ -250,12 +251,14 @@ def _print(
     found: Identification, values: dict[str, Any], checked: Checked, *, as_json: bool
 ) -> None:
     """Parameters, errors before and after, and where the files are."""
-    from retwin.report.identification.texts import findings, interval, state, value
+    from retwin.report.identification.texts import findings, interval, interval_remark, state
+    from retwin.report.labels import significant
 
-    parameters = [
-        (p.name, "" if p.unit == "1" else p.unit, f"{p.start:.4g}", value(p), interval(p), state(p))
-        for p in found.parameters
-    ]
+    parameters = []
+    for p in found.parameters:
+        after = significant(p.value, p.error)
+        unit = "" if p.unit == "1" else p.unit
+        parameters.append((p.name, unit, f"{p.start:.4g}", after, interval(p), state(p)))
     held = found.compared == "validation"
     errors = []
     for each in found.outputs:
@@ -267,19 +270,20 @@ def _print(
     heads = ["RMS error", "unit", "used: before", "after"]
     heads += ["held out: before", "after "] if held else []
     heads += ["mean alone"]
+    remark, said = interval_remark(found), findings(found, values["notes"])
     answer(
         values,
         table(("parameter", "unit", "before", "after", "95 % interval", ""), parameters),
+        *[remark] * bool(remark),
         "",
         table(heads, errors, numbers=heads[2:]),
         "",
-        *findings(found),
-        *values["notes"],
+        *said,
+        *(each for each in values["notes"] if each not in said),
         *shown_records(checked),
         as_json=as_json,
     )
     if values["updated_case"]:
         note(f"No updated.toml: {values['updated_case']}")
-    for name in ("report.html", "identification.json", "updated.toml", "start_values.json"):
-        if name in values["files"]:
-            note(f"Saved {values['files'][name]}")
+    for path in values["files"].values():
+        note(f"Saved {path}")

@@ -183,7 +183,7 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
     """What is better than the model, in sentences."""
     made = []
     words = {"twin": "the twin before its update", "mean": "the mean of the record itself"}
-    words["hold"] = "the last measured sample"
+    words["hold"] = "the first sample" if scores[0].horizon is None else "the last measured sample"
     for each in scores:
         if each.who != "model":
             own = next(s for s in scores if s.who == "model" and s.output == each.output)

@@ -67,6 +67,8 @@ class Proposal:
         The channel of each signal that was chosen.
     open_channels : tuple of str
         Channels of the case for which no signal was found; the user names it in the file.
+    by_unit : tuple of str
+        Channels of the case whose signal was chosen by its unit alone.
 
     """
 
@@ -76,6 +78,7 @@ class Proposal:
     facts: tuple[Fact, ...]
     channels: dict[str, str] = field(default_factory=dict)
     open_channels: tuple[str, ...] = field(default=())
+    by_unit: tuple[str, ...] = field(default=())
 
 
 def propose_mapping(
@@ -208,7 +211,8 @@ def proposed(
     """A mapping of the signals of a log to channels.
 
     With a case, each of its channels gets the signal whose name is most like its own, and whose
-    unit fits. Without, signals that change are commands or outputs by their names.
+    unit fits, else the only one that is left whose unit fits. Without, signals that change are
+    commands or outputs by their names.
 
     Parameters
     ----------
@@ -240,6 +244,7 @@ def proposed(
             remedy="check that it is the right log",
         )
     chosen = _by_name(moving) if case is None else _for_case(moving, case)
+    by_unit = _add_by_unit(chosen, moving, units_of(case))
     used = [fact for table in chosen.values() for fact in table.values() if fact is not None]
     rate = case.rate if case is not None else 0.0
     # Signals that are not chosen yet may be the faster ones.
@@ -266,11 +271,11 @@ def proposed(
         rate=rate, time=time, cut=cut, commands=commands, outputs=outputs
     )
     mapping = draft if draft.outputs else None
-    text = mapping_text(log, draft, chosen, facts, case, delay)
+    text = mapping_text(log, draft, chosen, facts, case, delay, by_unit)
     channels = {
         fact.name: channel for table in chosen.values() for channel, fact in table.items() if fact
     }
-    return Proposal(log, text, mapping, tuple(facts), channels, unknown)
+    return Proposal(log, text, mapping, tuple(facts), channels, unknown, by_unit)
 
 
 def _moves(fact: Fact) -> bool:
@@ -349,6 +354,33 @@ def _for_case(moving: Sequence[Fact], case: DataCase, *, alike: float = 0.72) ->
     if len(left) == len(marked) == 1 and _may_be(marked[0].unit, units.get(left[0], "")):
         chosen["commands"][left[0]] = marked[0]
     return chosen
+
+
+def _add_by_unit(chosen: Chosen, moving: Sequence[Fact], units: dict[str, str]) -> tuple[str, ...]:
+    """Choose the signal of each channel without one whose unit is that of one signal alone.
+
+    A signal that is named like a command is no output, and none that several channels may have is
+    chosen. Returns the channels.
+    """
+    taken = {fact.name for table in chosen.values() for fact in table.values() if fact}
+    fitting = {
+        (table, channel): [
+            each
+            for each in moving
+            if each.name not in taken
+            and each.unit
+            and compatible(each.unit, units[channel])
+            and (table == "commands" or not COMMAND.search(each.name.lower()))
+        ]
+        for table, channels in chosen.items()
+        for channel, fact in channels.items()
+        if fact is None and channel in units
+    }
+    named = [fact.name for some in fitting.values() for fact in some]
+    alone = [at for at, own in fitting.items() if len(own) == 1 == named.count(own[0].name)]
+    for table, channel in alone:
+        chosen[table][channel] = fitting[table, channel][0]
+    return tuple(channel for _, channel in alone)
 
 
 def _may_be(unit: str, wanted: str) -> bool:

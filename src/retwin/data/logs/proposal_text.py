@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from importlib import resources
 
@@ -72,6 +72,7 @@ def mapping_text(
     facts: Sequence[Fact],
     case: DataCase | None = None,
     delay: float | None = None,
+    by_unit: Collection[str] = (),
 ) -> str:
     """The mapping.toml, with what is seen of the log in comments.
 
@@ -89,6 +90,8 @@ def mapping_text(
         Its units are those of the channels.
     delay : float, optional
         The median time in s from the header stamps of messages to their recording, if known.
+    by_unit : collection of str
+        Channels whose signal was chosen by its unit alone.
 
     """
     time = draft.time
@@ -109,6 +112,7 @@ def mapping_text(
         spare=case is not None and not case.rate,
         time=time.model_dump(exclude_defaults=True) | ({"column": column} if column else {}),
         delay=delay,
+        by_unit=by_unit,
         rest=[each for each in facts if each.name not in used],
         skipped=[pair for pair in log.skipped.items() if pair[1] not in (TIMES, NO_STAMP)],
         listed=MAX_LISTED,

@@ -21,20 +21,51 @@ NONE = frozenset({"", "1", "-", "none", "unitless", "dimensionless"})
 """Units of what has no unit."""
 SPELT = {
     "%": "percent",
+    "pct": "percent",
+    "%RH": "percent",
+    "% RH": "percent",
     "C": "degC",
-    "°C": "degC",
+    "℃": "degC",
     "F": "degF",
-    "°F": "degF",
     "°": "deg",
     "1/min": "rpm",
     "U/min": "rpm",
     "min-1": "rpm",
     "min^-1": "rpm",
-    "m/s2": "m/s^2",
+    "RPM": "rpm",
     "kph": "km/h",
-    "l/min": "liter/min",
+    "lpm": "liter/min",
+    "gpm": "gallon/min",
+    "BAR": "bar",
+    "PSI": "psi",
+    "Ohm": "ohm",
 }
 """Spellings in logs, and those of pint. C is a temperature there, no charge."""
+RULES = tuple(
+    (re.compile(pattern), spelt)
+    for pattern, spelt in (
+        (r"(?<=[^\W\d_])²", "2"),
+        (r"(?<=[^\W\d_])³", "3"),
+        (r"(?i)(?<!\w)(?:deg(?:rees?)?[ ._]?|° ?)c(?!\w)", "degC"),
+        (r"(?i)(?<!\w)(?:deg(?:rees?)?[ ._]?|° ?)f(?!\w)", "degF"),
+        (r"(?<!\w)([hkmM]?(?:bar|Pa)|psi) ?(?:\(g\)|g)(?!\w)", r"\1g"),
+        (r"(?<!\w)([hkmM]?(?:bar|Pa)|psi) ?(?:\(a\)|\(?abs\)?|(?<! )a)(?!\w)", r"\1"),
+        (r"(?<![^\W\d_])([µucdkm]?m|in|ft|s|min|h|K)(-?[1-4])(?!\w)", r"\1^\2"),
+    )
+)
+"""Patterns of spellings within a unit, as in `W/(m2 °C)` and `bar(g)`, and how pint spells them."""
+DEFINITIONS = (
+    "newton_meter = newton * meter = Nm",
+    "reactive_volt_ampere = volt * ampere = var = VAr",
+    "normal_cubic_meter = [normal_volume] = Nm3",
+    "normal_liter = 0.001 * normal_cubic_meter = Nl = NL",
+    "standard_cubic_meter = [standard_volume] = Sm3",
+    "gauge_pascal = [gauge_pressure] = Pag",
+    "gauge_bar = 1e5 * gauge_pascal = barg",
+    "gauge_psi = 6894.757293168361 * gauge_pascal = psig",
+)
+"""Units that pint lacks. A normal volume stands for an amount of gas and a gauge pressure is one
+above that of the air, so that neither is converted to a volume or a pressure."""
 
 ENDING = re.compile(
     r"_((?:um|mm|cm|km|m?rad|deg[CF]?|rpm|k?Hz|[um]s|Nm|kN|[hkM]?Pa|m?bar|m[VA]|kWh?|kg|percent|pct)"
@@ -82,7 +113,10 @@ def converted(values: NDArray, source: str, target: str, where: str) -> NDArray:
     """
     if same_unit(source, target):
         return values
-    remedy = "give from_unit and unit as pint spells them, or a factor: scale = …"
+    remedy = (
+        "set from_unit = … or a factor, scale = …, of its channel in a mapping file, which retwin "
+        "data map proposes and --mapping reads"
+    )
     try:
         first, second = _unit(source), _unit(target)
         if _angular(first) != _angular(second):
@@ -112,6 +146,8 @@ def converted(values: NDArray, source: str, target: str, where: str) -> NDArray:
 
 def _unit(text: str) -> Any:
     text = SPELT.get(text.strip(), text.strip())
+    for pattern, spelt in RULES:
+        text = pattern.sub(spelt, text)
     if len(text) > LONGEST or not SAFE.fullmatch(text) or POWER_OF_NUMBER.search(text):
         raise ValueError("what is no unit")
     return _registry().Unit("" if text.lower() in NONE else text)
@@ -125,4 +161,7 @@ def _angular(unit: Any) -> bool:
 @cache
 def _registry() -> Any:
     pint = needs_extra("pint", "logs", "converts units")
-    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    made = pint.UnitRegistry(autoconvert_offset_to_baseunit=True, on_redefinition="ignore")
+    for each in DEFINITIONS:
+        made.define(each)
+    return made

@@ -25,7 +25,7 @@ class ModelScore:
     ----------
     who : str
         "model"; "twin", as it was before; "mean", that of the record itself; or "hold", the last
-        measured sample.
+        sample measured before the horizon, of free simulation the first one of the record.
     output : str
         Name of the output.
     horizon : float or None
@@ -161,7 +161,7 @@ def score_model(
     Returns
     -------
     list of ModelScore
-        Of the model, the twin, the mean of the record and the last measured sample, per output.
+        Of the model, the twin, the mean of the record and a measured sample of it, per output.
 
     Raises
     ------

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isfinite, isnan
 
+from retwin.cases.measured import CONSTANT
 from retwin.evaluation.identification import Direction, Identification, ParameterEstimate, RMSError
 from retwin.evaluation.identification.parameters import WIDEST
 from retwin.report.assets import sentences
@@ -87,8 +89,42 @@ def percent(ratio: float) -> str:
     return f"{100 * (ratio - 1):+.{2 if ratio < SMALL else 0}f}".replace("-", "−")
 
 
-def findings(found: Identification) -> list[str]:
-    """What a reader must know, in sentences, the most important first."""
+def interval_remark(found: Identification) -> str:
+    """What intervals leave out where the residuals show that the twin lacks something; else ""."""
+    if not (_coloured(found) or _driven(found)):
+        return ""
+    return (
+        "The intervals are those of the values that fit this twin best: physical values may lie "
+        "outside, since it does not fit the data (see the residuals)."
+    )
+
+
+def _coloured(found: Identification) -> list[str]:
+    """Outputs whose residuals are not white."""
+    return [each.name for each in found.residuals if each.p_white < WHITE]
+
+
+def _driven(found: Identification) -> list[str]:
+    """Residuals and the commands on which they depend."""
+    return [
+        f"{each.name} on {test.name}"
+        for each in found.residuals
+        for test in each.inputs
+        if test.p_value < WHITE
+    ]
+
+
+def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
+    """What a reader must know, in sentences, the most important first.
+
+    Parameters
+    ----------
+    found : Identification
+        The result.
+    notes : sequence of str
+        Of the logs, of which those are taken that say that a log shows nothing.
+
+    """
     result, names = found.found, [each.name for each in found.parameters]
     errors = list(found.errors(found.compared).items())
     posterior = isinstance(result, Posterior)
@@ -97,12 +133,7 @@ def findings(found: Identification) -> list[str]:
         (names[j], names[i], found.correlation[i, j]) for i in range(len(names)) for j in range(i)
     ]
     strong = [f"{a} and {b} ({signed(r, 2)})" for a, b, r in pairs if abs(r) > STRONG]
-    driven = [
-        f"{each.name} on {test.name}"
-        for each in found.residuals
-        for test in each.inputs
-        if test.p_value < WHITE
-    ]
+    means = {each.name: each.mean for each in found.outputs}
     return sentences(
         "findings",
         found=found,
@@ -117,16 +148,19 @@ def findings(found: Identification) -> list[str]:
         better=sum(each.ratio < 1 for _, each in errors),
         undecided=[n for n, e in errors if e.interval and e.interval[0] <= 1 <= e.interval[1]],
         units={each.name: behind("", each.unit) for each in found.outputs},
-        means={each.name: each.mean for each in found.outputs},
+        means=means,
+        nothing=[each for each in notes if each.endswith(CONSTANT)],
+        bounds=[each for each in found.parameters if each.at_bound],
+        worse=[name for name, each in errors if each.after >= means[name]],
         whole=next((each.error for each in horizons if each.length is None), None),
         settable=state_based(found.twin),
         larger=[pair for pair in found.begin_errors.items() if pair[1] > ELSEWHERE],
         unknown=[p for p in found.parameters if not (p.identified or p.at_bound or p.depends)],
         depending=[each.name for each in found.parameters if each.depends],
         strong=strong[:SENTENCES],
-        coloured=[each.name for each in found.residuals if each.p_white < WHITE],
+        coloured=_coloured(found),
         white=WHITE,
-        driven=driven[: 2 * SENTENCES],
+        driven=_driven(found)[: 2 * SENTENCES],
         misfit=MISFIT,
         without_error=any(isnan(p.error) and not p.at_bound for p in found.parameters),
     )
@@ -136,15 +170,11 @@ def next_steps(found: Identification) -> list[str]:
     """What to do next, by names in the template: what is most worth the effort first."""
     errors = found.errors(found.compared).values()
     worse = any(each.ratio >= 1 or (each.interval or (0, 0))[1] >= 1 for each in errors)
-    lacks = any(
-        each.p_white < WHITE or any(test.p_value < WHITE for test in each.inputs)
-        for each in found.residuals
-    )
     unsettled = bool(found.open_parameters) or any(each.at_bound for each in found.parameters)
     needed = {
         "settle": unsettled,
         "hold_out": found.compared != "validation",
-        "correct": lacks,
+        "correct": bool(interval_remark(found)),
         "check": worse,
     }
     return [name for name, holds in needed.items() if holds] or ["use"]
