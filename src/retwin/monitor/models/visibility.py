@@ -6,6 +6,7 @@ measured, and the monitor watches the sum. So noise and dependence are those of 
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -150,8 +151,9 @@ def _share(
         observed = observed + (faulty - calm)
     seen = windows.cut(healthy.mask)
     measured = np.where(seen, windows.cut(observed, by_record=False), np.nan)
-    state = monitor.start(len(measured))
-    alarm = monitor.step(state, windows.cut(healthy.commands), measured)[1].alarm
-    # What alarms before the onset alarms again while its event lasts.
+    # Only the first alarm counts: one that never alarms does not begin anew after each of them.
+    silent = replace(monitor, arl=sys.float_info.max)
+    state, known = silent.start(len(measured)), windows.cut(healthy.commands)
+    alarm = monitor.rules.alarms(silent.step(state, known, measured)[1].evidence)
     quiet = np.flatnonzero(~alarm[:, : windows.lead].any(axis=1))
     return float(alarm[quiet, windows.lead :].any(axis=1).mean()) if len(quiet) else np.nan
