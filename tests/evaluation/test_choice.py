@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 import retwin as rt
 from retwin.evaluation import predict_records
 from retwin.evaluation.choice.comparison import Comparison, Predicted
-from retwin.evaluation.choice.fitting import with_yardstick
+from retwin.evaluation.choice.fitting import _row, with_yardstick
 from retwin.evaluation.choice.folds import Fold, block_means, folds_of
+from retwin.evaluation.choice.remarks import remarks_of
 from retwin.report.choice import fit_page
 from retwin.twins import State, StateTwin
 from retwin.update import Dynamics, StationaryNoise, free_moments
@@ -276,6 +277,29 @@ def test_an_identification_is_named_where_a_model_is_expected(tmp_path: Path) ->
     (tmp_path / "identification.json").write_text("{}")
     with pytest.raises(rt.InputError, match="the folder of an identification"):
         rt.load_twin(tmp_path)
+
+
+def test_no_dead_time_is_mentioned_of_an_output_that_never_changes() -> None:
+    """A transient of the twin, moved out of the record, would explain all of its errors."""
+    data = records(0, slope=right)
+    data = data.replace(observed=np.full_like(data.observed, 7.0))
+    remarks = remarks_with(data, none=np.exp(-np.arange(600) / 20)[None, :, None])
+    assert not any("earlier" in each or "dead time" in each for each in remarks)
+
+
+def remarks_with(data: rt.Trajectories, **errors: NDArray) -> tuple[str, ...]:
+    """What is said of candidates with such errors (n, T, d_y), which need no fit."""
+    folds = folds_of(data)
+    predicted = {
+        name: [
+            Predicted((data.observed + e)[f.rows], 1 + 0 * e[f.rows], 0 * e[f.rows]) for f in folds
+        ]
+        for name, e in errors.items()
+    }
+    comparison = Comparison(data, folds, predicted)
+    chosen, differences = comparison.simplest()
+    scores = [_row(name, comparison, differences, 0.0, "") for name in errors]
+    return remarks_of(twin_of(), data, comparison, scores, chosen, chosen, None)
 
 
 def test_folds_leave_out_what_is_measured_and_never_the_start_of_one_record() -> None:

@@ -81,7 +81,7 @@ def _of_twin(
         y = np.where(records.mask[..., channel], records.observed[..., channel], np.nan)
         y, x = y.astype(np.float64), nominal[..., channel]
         both = np.isfinite(y) & np.isfinite(x)
-        if both.sum() < 2 or np.std(x[both]) == 0:
+        if both.sum() < 2 or not (np.ptp(x[both]) and np.ptp(y[both])):  # one that never changes
             continue
         if np.corrcoef(x[both], y[both])[0, 1] < 0:
             continue
