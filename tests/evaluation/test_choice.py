@@ -76,7 +76,7 @@ def radiating(heat: float, power: float) -> float:
 def test_a_right_twin_has_nothing_to_correct() -> None:
     found = rt.fit(twin_of(), records(0, slope=right), rt.Choice(candidates=FAST))
     assert found.chosen == "parameters"
-    assert any(each.startswith("Nothing to correct") for each in found.remarks)
+    assert any("o correction is clearly better" in each for each in found.remarks)
     _, alone, now = found.parameters["gain"]
     assert alone == now == pytest.approx(0.3, rel=0.01)
 
@@ -300,6 +300,29 @@ def remarks_with(data: rt.Trajectories, **errors: NDArray) -> tuple[str, ...]:
     chosen, differences = comparison.simplest()
     scores = [_row(name, comparison, differences, 0.0, "") for name in errors]
     return remarks_of(twin_of(), data, comparison, scores, chosen, chosen, None)
+
+
+def test_a_correction_that_is_better_by_chance_is_said_to_be_so() -> None:
+    rng = np.random.default_rng(0)
+    data = records(*range(4), slope=right)
+    noise = rng.normal(size=data.observed.shape)
+    (said,) = remarks_with(data, none=noise, dynamics=1.1 * noise)
+    assert said.startswith("Nothing to correct")
+    other = 0.98 * rng.normal(size=noise.shape)
+    (said,) = remarks_with(data, none=noise, dynamics=other)
+    assert "No correction is clearly better than the twin" in said
+    assert "(corrected state equations) is better by" in said
+    assert "within one standard error" in said
+
+
+def test_errors_that_no_correction_expresses_are_mentioned() -> None:
+    data = records(*range(4), slope=right)
+    noise = np.random.default_rng(0).normal(size=data.observed.shape)
+    drift = np.linspace(-1, 1, data.steps)[:, None]
+    slow = 2 * np.cos(30 * drift)
+    for error, said in ((drift, "depend on the time"), (slow, "are correlated in time")):
+        remarks = remarks_with(data, none=noise + error)
+        assert any(f"The errors there {said}" in each for each in remarks)
 
 
 def test_folds_leave_out_what_is_measured_and_never_the_start_of_one_record() -> None:
