@@ -222,6 +222,20 @@ def test_no_band_is_given_where_commands_leave_the_range_of_the_calibration() ->
     assert np.isfinite([row.crps, row.coverage, row.width]).all()
 
 
+@pytest.mark.parametrize("drift", [0.0, 2.0])
+def test_bands_of_longer_records_are_given_where_errors_do_not_drift(drift: float) -> None:
+    data = records(0, slope=right)
+    data = data.replace(observed=data.observed + np.linspace(0, drift, 600)[:, None])
+    found = rt.fit(twin_of(), data, rt.Choice(candidates=("parameters",)))
+    longer = records(1, slope=right, steps=800)
+    said = "no band is given" if drift else "were not tried"
+    with pytest.warns(rt.update.OutsideTrainingWarning, match=f"1 of 1 .* 600 s; .*{said} after"):
+        given = np.isfinite(predict_records(found.twin, longer).deviation[0, :, 0])
+    assert given[:600].any()
+    assert given[600:].any() == (not drift)
+    assert np.isfinite(predict_records(found.twin, longer, horizon=5.0).deviation[0, -1])
+
+
 def test_a_twin_without_equations_and_case_is_given_when_it_is_loaded(tmp_path: Path) -> None:
     twin = rt.FunctionTwin(lambda u: np.cumsum(u, axis=1) * 0.1, INPUTS, OUTPUTS, 1.0)
     found = rt.fit(twin, records(0, slope=right), rt.Choice(candidates=("none",)))
