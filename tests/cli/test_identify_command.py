@@ -229,6 +229,16 @@ def test_what_the_logs_do_not_determine_is_said(place: Path, call) -> None:
     assert "do not determine spare" in Path("out/report.html").read_text("utf-8")
 
 
+def test_records_that_never_move_have_a_result_that_says_so(place: Path, call) -> None:
+    for i in range(2):
+        write(place / f"tank{i}.csv", valve=np.full(100, 0.3), level=np.full(100, 7.0))
+    code, out, err = call("identify", "tank.toml", "tank0.csv", "tank1.csv", "--out", "out")
+    assert code == 0, err
+    assert "empty slice" not in err
+    assert "never changes: is 7 all the time" in " ".join(out.split())
+    assert result()["records"]["explained"] == {"healthy": {}}
+
+
 def test_a_value_at_its_bound_has_no_error(place: Path, call) -> None:
     code, out, _ = call(
         "identify", "tank.toml", "tank0.csv", "--free", "gain=0.05:0.11", "--out", "out"

@@ -13,8 +13,9 @@ import retwin as rt
 from retwin.cli.models import _verdict
 from retwin.evaluation import ModelScore, predict_records
 from retwin.evaluation.choice.comparison import Comparison, Predicted
-from retwin.evaluation.choice.fitting import with_yardstick
+from retwin.evaluation.choice.fitting import _row, with_yardstick
 from retwin.evaluation.choice.folds import Fold, block_means, folds_of
+from retwin.evaluation.choice.remarks import remarks_of
 from retwin.report.choice import fit_page
 from retwin.twins import State, StateTwin
 from retwin.update import Dynamics, StationaryNoise, free_moments
@@ -76,7 +77,7 @@ def radiating(heat: float, power: float) -> float:
 def test_a_right_twin_has_nothing_to_correct() -> None:
     found = rt.fit(twin_of(), records(0, slope=right), rt.Choice(candidates=FAST))
     assert found.chosen == "parameters"
-    assert any(each.startswith("Nothing to correct") for each in found.remarks)
+    assert any("o correction is clearly better" in each for each in found.remarks)
     _, alone, now = found.parameters["gain"]
     assert alone == now == pytest.approx(0.3, rel=0.01)
 
@@ -223,6 +224,20 @@ def test_no_band_is_given_where_commands_leave_the_range_of_the_calibration() ->
     assert np.isfinite([row.crps, row.coverage, row.width]).all()
 
 
+@pytest.mark.parametrize("drift", [0.0, 2.0])
+def test_bands_of_longer_records_are_given_where_errors_do_not_drift(drift: float) -> None:
+    data = records(0, slope=right)
+    data = data.replace(observed=data.observed + np.linspace(0, drift, 600)[:, None])
+    found = rt.fit(twin_of(), data, rt.Choice(candidates=("parameters",)))
+    longer = records(1, slope=right, steps=800)
+    said = "no band is given" if drift else "were not tried"
+    with pytest.warns(rt.update.OutsideTrainingWarning, match=f"1 of 1 .* 600 s; .*{said} after"):
+        given = np.isfinite(predict_records(found.twin, longer).deviation[0, :, 0])
+    assert given[:600].any()
+    assert given[600:].any() == (not drift)
+    assert np.isfinite(predict_records(found.twin, longer, horizon=5.0).deviation[0, -1])
+
+
 def test_a_twin_without_equations_and_case_is_given_when_it_is_loaded(tmp_path: Path) -> None:
     twin = rt.FunctionTwin(lambda u: np.cumsum(u, axis=1) * 0.1, INPUTS, OUTPUTS, 1.0)
     found = rt.fit(twin, records(0, slope=right), rt.Choice(candidates=("none",)))
@@ -278,6 +293,52 @@ def test_an_identification_is_named_where_a_model_is_expected(tmp_path: Path) ->
     (tmp_path / "identification.json").write_text("{}")
     with pytest.raises(rt.InputError, match="the folder of an identification"):
         rt.load_twin(tmp_path)
+
+
+def test_no_dead_time_is_mentioned_of_an_output_that_never_changes() -> None:
+    """A transient of the twin, moved out of the record, would explain all of its errors."""
+    data = records(0, slope=right)
+    data = data.replace(observed=np.full_like(data.observed, 7.0))
+    remarks = remarks_with(data, none=np.exp(-np.arange(600) / 20)[None, :, None])
+    assert not any("earlier" in each or "dead time" in each for each in remarks)
+
+
+def remarks_with(data: rt.Trajectories, **errors: NDArray) -> tuple[str, ...]:
+    """What is said of candidates with such errors (n, T, d_y), which need no fit."""
+    folds = folds_of(data)
+    predicted = {
+        name: [
+            Predicted((data.observed + e)[f.rows], 1 + 0 * e[f.rows], 0 * e[f.rows]) for f in folds
+        ]
+        for name, e in errors.items()
+    }
+    comparison = Comparison(data, folds, predicted)
+    chosen, differences = comparison.simplest()
+    scores = [_row(name, comparison, differences, 0.0, "") for name in errors]
+    return remarks_of(twin_of(), data, comparison, scores, chosen, chosen, None)
+
+
+def test_a_correction_that_is_better_by_chance_is_said_to_be_so() -> None:
+    rng = np.random.default_rng(0)
+    data = records(*range(4), slope=right)
+    noise = rng.normal(size=data.observed.shape)
+    (said,) = remarks_with(data, none=noise, dynamics=1.1 * noise)
+    assert said.startswith("Nothing to correct")
+    other = 0.98 * rng.normal(size=noise.shape)
+    (said,) = remarks_with(data, none=noise, dynamics=other)
+    assert "No correction is clearly better than the twin" in said
+    assert "(corrected state equations) is better by" in said
+    assert "within one standard error" in said
+
+
+def test_errors_that_no_correction_expresses_are_mentioned() -> None:
+    data = records(*range(4), slope=right)
+    noise = np.random.default_rng(0).normal(size=data.observed.shape)
+    drift = np.linspace(-1, 1, data.steps)[:, None]
+    slow = 2 * np.cos(30 * drift)
+    for error, said in ((drift, "depend on the time"), (slow, "are correlated in time")):
+        remarks = remarks_with(data, none=noise + error)
+        assert any(f"The errors there {said}" in each for each in remarks)
 
 
 def test_folds_leave_out_what_is_measured_and_never_the_start_of_one_record() -> None:

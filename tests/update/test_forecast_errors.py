@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import retwin as rt
 from retwin.update.forecast_errors import (
@@ -13,6 +14,7 @@ from retwin.update.forecast_errors import (
     range_excess,
     value_range,
 )
+from retwin.update.forecasts import errors_drift
 
 
 @pytest.mark.parametrize("independent", [6, 12, 200])
@@ -59,5 +61,26 @@ def test_saved_values_that_do_not_fit_are_refused() -> None:
     again = ForecastErrors.of(values)
     assert again is not None
     assert again.values == values
+    assert (again.longest, again.drifts) == (np.inf, False)
+    limited = ForecastErrors.of(values | {"longest": 3.0, "drifts": True})
+    assert limited is not None
+    assert (limited.values["longest"], limited.values["drifts"]) == (3.0, True)
+    np.testing.assert_array_equal(np.flatnonzero(limited.late(35, 10.0)), np.arange(30, 35))
+    before = {name: each for name, each in values.items() if name not in ("longest", "drifts")}
+    assert ForecastErrors.of(before).values == values  # type: ignore[union-attr]
     with pytest.raises(rt.InputError, match="ranges from low to high"):
         ForecastErrors.of(values | {"low": [5.0, 5.0]})
+
+
+@pytest.mark.parametrize("trend", [0.0, 0.5])
+def test_errors_drift_where_their_mean_has_a_trend(trend: float) -> None:
+    """Independent and correlated ones; by chance, they seem to do so once in a hundred times."""
+    rng, time = np.random.default_rng(0), np.linspace(-1, 1, 500)
+    found = []
+    for memory in (0.0, 0.9) * 50:
+        noise = lfilter([1 - memory], [1, -memory], rng.normal(size=(4, 600)))[:, 100:]
+        made = trend * time + noise
+        made[:, 200:220] = np.nan
+        found.append(errors_drift(made[..., None]))
+    assert np.mean(found) == pytest.approx(float(trend > 0), abs=0.05)
+    assert not errors_drift(np.full((1, 9, 2), np.nan))

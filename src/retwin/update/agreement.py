@@ -79,6 +79,7 @@ def _find_exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
 
 
 def _unexplained_share(records: Trajectories) -> float:
-    """Share of the variance of outputs that nominal ones do not explain, over all outputs."""
+    """Share of the variance that nominal outputs do not explain, over all outputs that change."""
     shares = explained_shares(records)
-    return float(np.nanmean([1 - each for own in shares.values() for each in own.values()]))
+    left = [1 - each for own in shares.values() for each in own.values() if np.isfinite(each)]
+    return float(np.mean(left or [0.0]))

@@ -54,6 +54,10 @@ class ForecastErrors:
     beyond : float
         How far a value may leave that range, in widths of it: as far as the parts that were left
         out left the range of the others while the bands held.
+    longest : float
+        Time in s of the longest record of the calibration; infinite where it is not known.
+    drifts : bool
+        Whether errors of free simulation depended on the time in the record.
 
     """
 
@@ -65,6 +69,8 @@ class ForecastErrors:
     low: NDArray
     high: NDArray
     beyond: float
+    longest: float = np.inf
+    drifts: bool = False
 
     def at(self, lead: float) -> tuple[NDArray, NDArray]:
         """Persistence and deviation (d_y,) of any time ahead in s, interpolated over its log."""
@@ -97,12 +103,18 @@ class ForecastErrors:
         last = np.maximum.accumulate(np.where(far, steps, -np.inf), axis=1)
         return np.asarray(steps - last <= self.memory * rate)
 
+    def late(self, steps: int, rate: float) -> NDArray:
+        """Samples (T,) of a free simulation after the time of the longest record."""
+        return np.arange(steps) > self.longest * rate - 0.5
+
     @property
     def values(self) -> dict[str, Any]:
         """As JSON values; an infinite time is null."""
         leads = [each if np.isfinite(each) else None for each in self.leads.tolist()]
         arrays = {name: getattr(self, name).tolist() for name in (*BY_LEAD, "low", "high")}
-        return {"leads": leads, **arrays, "memory": self.memory, "beyond": self.beyond}
+        longest = self.longest if np.isfinite(self.longest) else None
+        times = {"memory": self.memory, "longest": longest, "drifts": self.drifts}
+        return {"leads": leads, **arrays, "beyond": self.beyond, **times}
 
     @classmethod
     def of(cls, values: Mapping[str, Any] | None) -> ForecastErrors | None:
@@ -126,7 +138,12 @@ class ForecastErrors:
             remedy="save the model again",
         )
         memory, beyond = float(values["memory"]), float(values["beyond"])
-        return cls(leads=leads, memory=memory, beyond=beyond, **arrays)
+        # Models that were saved before have neither of these.
+        longest, drifts = values.get("longest"), bool(values.get("drifts"))
+        longest = np.inf if longest is None else float(longest)
+        return cls(
+            leads=leads, memory=memory, beyond=beyond, longest=longest, drifts=drifts, **arrays
+        )
 
 
 def value_range(values: NDArray) -> tuple[NDArray, NDArray]:

@@ -9,6 +9,7 @@ from math import ceil
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from retwin.data.trajectories import Trajectories
 from retwin.twins.equations.interpolation import TAPS
@@ -33,6 +34,8 @@ ORIGINS = 2000
 """Samples from which predictions start, at most, of all trajectories together."""
 LEADS = (1, 3, 10, 30, 100)
 """Samples ahead at which errors are calibrated."""
+DRIFT = 0.01
+"""Probability of a trend of errors over the time in a record that is no chance."""
 FORGOTTEN = 5.0
 """Correlation times of errors after which one of them is forgotten."""
 
@@ -214,7 +217,41 @@ def calibrate_forecasts(
         known.append(np.concatenate([unknown, predicted], axis=2))
     width = known[0].shape[2]
     low, high = value_range(np.concatenate([each.reshape(1, -1, width) for each in known], axis=1))
-    return ForecastErrors(times, persistence, deviation, independent, memory, low, high, beyond)
+    free = [_errors(part, len(leads))[0] for part in found if not part.edge]
+    longest, drifts = (
+        float(records.lengths.max() / records.rate),
+        errors_drift(np.concatenate(free)),
+    )
+    rows_by_lead = (times, persistence, deviation, independent)
+    return ForecastErrors(*rows_by_lead, memory, low, high, beyond, longest, drifts)
+
+
+def errors_drift(errors: NDArray) -> bool:
+    """Whether the mean error of an output has a linear trend over the time in a record.
+
+    By Student's t test of the slope, with as many errors as are independent beside the trend.
+
+    Parameters
+    ----------
+    errors : ndarray, shape (r, T, d_y)
+        Of samples that were left out of a fit, NaN elsewhere; a row is a record, or a part of one.
+
+    """
+    for own in np.moveaxis(errors, 2, 0):
+        seen = np.isfinite(own)
+        if not seen.any():
+            continue
+        time = np.nonzero(seen)[1] - np.nonzero(seen)[1].mean()
+        power = float(time @ time)
+        slope = float(time @ own[seen]) / (power or 1.0)
+        rest = np.zeros(own.shape)
+        rest[seen] = own[seen] - own[seen].mean() - slope * time
+        free = seen.sum() / correlation_time(rest[..., None]) - 2
+        if free > 0 and power > 0:
+            deviation = np.sqrt(np.sum(rest**2) / (free * power))
+            if abs(slope) > stdtrit(free, 1 - DRIFT / 2 / errors.shape[2]) * deviation:
+                return True
+    return False
 
 
 def _errors(part: LeftOut, i: int) -> tuple[NDArray, NDArray]:

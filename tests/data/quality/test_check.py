@@ -155,3 +155,13 @@ def test_share_of_the_variance() -> None:
     assert shares["healthy"]["y1"] > 0.95
     assert shares["faulty"]["y1"] != shares["faulty"]["y1"]  # it never changes there
     assert "95" in " ".join(check_records(records).sentences) or shares["healthy"]["y2"] > 0.95
+
+
+def test_outputs_that_never_change_have_no_share() -> None:
+    """Nor does one that was never measured: JSON has no NaN, and numpy would warn of it."""
+    observed = np.array(clean().observed)
+    observed[..., 0], observed[..., 1] = 7.0, np.nan
+    found = check_records(clean().replace(observed=observed, mask=None))
+    assert found.values["explained"] == {"healthy": {}}
+    assert found.sentences == []
+    assert [each.channel for each in found.findings if each.kind == "never changes"] == ["y1"]

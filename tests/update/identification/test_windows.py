@@ -12,6 +12,7 @@ import retwin as rt
 from retwin.evaluation import hold_out, validate_identification
 from retwin.report.identification.texts import findings
 from retwin.twins import FunctionTwin, Parameter, ParametricTwin, State, StateTwin
+from retwin.update.dynamics.arrow import Arrow, bounded_step
 from retwin.update.identification import LeastSquares, identify
 from retwin.update.identification.misfit import misfit_of
 
@@ -153,3 +154,25 @@ def test_a_start_is_inferred_unless_it_is_given() -> None:
     assert free.values["gain"] == pytest.approx(GAIN, rel=1e-3)
     fixed = replace(LAG, states=(State("level", "m", 0.0),)).parametric()
     assert identify(fixed, observed, QUICK, seed=0).values["gain"] != pytest.approx(GAIN, rel=0.05)
+
+
+@pytest.mark.parametrize("horizon", [None, 2.0])
+def test_an_output_that_was_never_measured_is_left_out(horizon: float | None) -> None:
+    """Its column is there, and empty: its size is not NaN, with which a search never ended."""
+    both = rt.Channels(("y", "v"), ("m", "m/s"))
+    twin = replace(CART, output=lambda x, u, p: (x.position, x.velocity), outputs=both)
+    one = in_closed_loop(seconds=8.0)
+    outputs = np.concatenate([one.observed, np.full_like(one.observed, np.nan)], axis=2)
+    observed = replace(
+        one, nominal=np.zeros_like(outputs), observed=outputs, mask=None, outputs=both
+    )
+    found = identify(twin.parametric(), observed, QUICK, seed=0, horizon=horizon)
+    alone = identify(CART.parametric(), one, QUICK, seed=0, horizon=horizon)
+    assert found.horizon == alone.horizon < np.inf
+    assert found.values["gain"] == pytest.approx(alone.values["gain"], rel=1e-3)
+
+
+def test_a_step_that_is_not_finite_ends_the_search() -> None:
+    curvature = Arrow(np.zeros((0, 0)), np.zeros((1, 1, 0)), np.full((1, 1, 1), np.nan))
+    end = np.full(1, np.inf)
+    assert np.isnan(bounded_step(curvature, np.full(1, np.nan), 1.0, -end, end)).all()

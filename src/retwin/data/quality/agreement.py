@@ -60,6 +60,7 @@ def explained_shares(records: Trajectories) -> dict[str, dict[str, float]]:
 def find_disagreements(records: Trajectories) -> Iterator[Finding]:
     """Records of other commands, exchanged outputs, other units, time bases, and wrong labels."""
     varies = np.ptp(records.nominal, axis=(0, 1)) > 0 if len(records) else np.zeros(0, bool)
+    varies &= records.mask.any(axis=(0, 1))
     if not varies.any():
         return
     y = np.where(records.mask, records.observed, np.nan)[..., varies].astype(float)

@@ -41,16 +41,24 @@ class Checked:
     def sentences(self) -> list[str]:
         """How much of the variance nominal outputs explain, in a sentence; none where unknown."""
         parts = []
-        for kind, shares in self.explained.items():
+        for kind, shares in self._known.items():
             own = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in shares.items())
             which = "" if len(self.explained) == 1 else f" in {kind} records"
-            parts.append(f"{own}{which}")
+            parts += [f"{own}{which}"] * bool(own)
         return [f"The twin as it was given explains {'; '.join(parts)} (variance)."] * bool(parts)
 
     @property
     def values(self) -> dict[str, Any]:
-        """The same as JSON values."""
-        return {"findings": [asdict(each) for each in self.findings], "explained": self.explained}
+        """The same as JSON values, without the shares of outputs that never change."""
+        return {"findings": [asdict(each) for each in self.findings], "explained": self._known}
+
+    @property
+    def _known(self) -> dict[str, dict[str, float]]:
+        """`explained` without NaN, which findings state as outputs that never change."""
+        return {
+            kind: {name: share for name, share in shares.items() if np.isfinite(share)}
+            for kind, shares in self.explained.items()
+        }
 
 
 def check_records(records: Trajectories) -> Checked:

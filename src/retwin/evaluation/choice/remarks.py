@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,15 @@ from retwin.data.trajectories import Trajectories
 from retwin.evaluation.choice.comparison import Comparison
 from retwin.evaluation.choice.fitted import CandidateScore
 from retwin.evaluation.choice.folds import RECORDS
+from retwin.scores.residuals import autocorrelation, ljung_box
 from retwin.twins.twin import Twin
+from retwin.update.forecasts import errors_drift
 
 LONGEST = 0.1
 """Longest dead time that is tried, over the length of a record."""
+WHITE, COLOURED = 0.01, 0.5
+"""p-value below which errors are no white noise, and autocorrelation from which most of their mean
+square is none."""
 
 
 def remarks_of(
@@ -42,15 +47,41 @@ def remarks_of(
             f"from fewer than {RECORDS} records, of which whole ones are left out."
         )
     if preferred in ("none", "parameters"):
-        more = " with its identified parameters" if preferred == "parameters" else ""
-        made.append(
-            f"Nothing to correct: no correction predicts parts of the records that were left out "
-            f"better than the twin{more}."
-        )
+        made += _uncorrected(comparison, by_name, preferred, free=horizon is None)
     baseline = "parameters" if "parameters" in comparison.predicted else "none"
     if baseline in comparison.predicted and horizon is None:
         made += _of_twin(records, comparison, baseline)
     return tuple(made)
+
+
+def _uncorrected(
+    comparison: Comparison, scores: Mapping[str, CandidateScore], name: str, *, free: bool
+) -> list[str]:
+    """How much better corrections are than the twin, and whether its errors are no noise.
+
+    Errors of free simulation are tested (`free`): others are correlated up to the time ahead.
+    """
+    who = "the twin with its identified parameters" if name == "parameters" else "the twin"
+    made = "Nothing to correct: no correction predicts parts of the records that were left out "
+    made += f"better than {who}."
+    if scores[name].difference > 0:
+        best = min((scores[each] for each in comparison.predicted), key=lambda each: each.crps)
+        made = f"No correction is clearly better than {who}: on parts of the records that were "
+        share = scores[name].difference / scores[name].crps
+        made += f"left out, the best one ({best.title}) is better by {share:.1%} (CRPS), which is "
+        made += "within one standard error."
+    errors = comparison.joined(lambda i: comparison.errors(name, i))
+    reasons = ["depend on the time in the record"] * errors_drift(errors)
+    found = [autocorrelation(own) for own in np.moveaxis(errors, 2, 0)]
+    if any(
+        np.nan_to_num(each.values).max(initial=0.0) > COLOURED and ljung_box(each)[1] < WHITE
+        for each in found
+    ):
+        reasons.append("are correlated in time")
+    if not (free and reasons):
+        return [made]
+    text = f"The errors there {' and '.join(reasons)}: the twin lacks something that these "
+    return [made, f"{text}corrections cannot express, if it is no disturbance from outside."]
 
 
 def _worse_than_mean(records: Trajectories, score: CandidateScore) -> list[str]:
@@ -81,7 +112,7 @@ def _of_twin(
         y = np.where(records.mask[..., channel], records.observed[..., channel], np.nan)
         y, x = y.astype(np.float64), nominal[..., channel]
         both = np.isfinite(y) & np.isfinite(x)
-        if both.sum() < 2 or np.std(x[both]) == 0:
+        if both.sum() < 2 or not (np.ptp(x[both]) and np.ptp(y[both])):  # one that never changes
             continue
         if np.corrcoef(x[both], y[both])[0, 1] < 0:
             continue

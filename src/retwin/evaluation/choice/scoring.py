@@ -84,7 +84,9 @@ def predict_records(
     -----
     OutsideTrainingWarning
         Commands or predicted outputs leave the range for which bands were calibrated, so that
-        there is none until the errors there are forgotten.
+        there is none until the errors there are forgotten. Or a free simulation is longer than the
+        records by which they were calibrated; there is none after that time if errors depended on
+        the time in the record.
 
     """
     check_channels(model, records, "records")
@@ -107,8 +109,11 @@ def predict_records(
     if errors is not None:
         values = np.concatenate([records.commands, mean], axis=2)
         outside = errors.outside(values, records.rate)
-        deviation = np.where(outside[..., None], np.nan, deviation)
         _warn_outside(outside, records)
+        late = errors.late(records.steps, records.rate) & (horizon is None)
+        _warn_late(errors, late, records)
+        outside |= late & errors.drifts
+        deviation = np.where(outside[..., None], np.nan, deviation)
     return ScoredPrediction(mean, deviation)
 
 
@@ -126,6 +131,21 @@ def _warn_outside(outside: NDArray, records: Trajectories) -> None:
             f"commands or outputs of {len(first)} of {len(records)} records leave the range for "
             f"which bands were calibrated, {name} after {time:.4g} s; no band is given there. "
             "Calibrate with records that contain these",
+            OutsideTrainingWarning,
+            stacklevel=3,
+        )
+
+
+def _warn_late(errors: ForecastErrors, late: NDArray, records: Trajectories) -> None:
+    """Warn of records with samples (T,) after the time of the longest one of the calibration."""
+    own = int((late & (np.arange(late.size) < records.lengths[:, None])).any(axis=1).sum())
+    text = "bands were not tried after that time"
+    if errors.drifts:
+        text = "no band is given after that time, since errors depended on the time in the record"
+    if own:
+        warnings.warn(
+            f"{own} of {len(records)} records are longer than those by which bands were "
+            f"calibrated, {errors.longest:.4g} s; {text}. Calibrate with longer records",
             OutsideTrainingWarning,
             stacklevel=3,
         )

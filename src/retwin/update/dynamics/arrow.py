@@ -142,7 +142,7 @@ def bounded_step(
     """A step as by `trust_region_step` with bounds (k + n m,) of each component.
 
     Where a component meets its bound, it stays there, and the others go on (the primal active-set
-    method: Nocedal and Wright, algorithm 16.3).
+    method: Nocedal and Wright, algorithm 16.3). It is NaN where the curvature or the gradient is.
     """
     step, fixed = np.zeros(len(gradient)), np.zeros(len(gradient), dtype=bool)
     while not fixed.all():
@@ -153,7 +153,7 @@ def bounded_step(
         with np.errstate(over="ignore"):  # one that does not move meets no bound
             share = np.divide(ends, further, out=np.full(len(step), np.inf), where=further != 0)
         share[fixed] = np.inf
-        if share.min() >= 1:
+        if not share.min() < 1:  # so NaN ends it, too
             return step + further
         step = step + share.min() * further
         fixed |= share <= share.min()

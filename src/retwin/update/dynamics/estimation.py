@@ -193,7 +193,7 @@ class Estimation:
             step = bounded_step(scaled, unit * gradient, radius, *ends)
             expected = -float(step @ (unit * gradient + scaled.times(step) / 2))
             length = float(np.linalg.norm(step))
-            if expected <= 0:
+            if not expected > 0:  # or NaN
                 break
             inside = np.clip(flat + unit * step, *self.bounds)
             tried = self.linearised(self.point(inside))

@@ -96,8 +96,7 @@ class Windows:
             outputs=self.observed.outputs,
             rate=self.observed.rate,
         )
-        values = np.where(own, cut.observed, np.nan)
-        spread = np.nanstd(values / self.unit, axis=(0, 1)).max(initial=0.0)
+        spread = (spread_of(cut) / self.unit).max(initial=0.0)
         variance = (RESOLUTION * (spread or 1.0) * self.unit) ** 2
         base = state_twin_of(self.twin)[0]
         return Estimation(base, cut, self._unknowns(self.twin), own, variance)
@@ -236,9 +235,18 @@ def windows_of(
     # A window without measurements has no start.
     kept = [used[r, f : f + size].any() for r, f in zip(rows, first, strict=True)]
     alike = len(set(observed.outputs.units)) == 1
-    spread = np.nanstd(np.where(observed.mask, observed.observed, np.nan), axis=(0, 1))
-    unit = np.ones(len(spread)) if alike else np.maximum(np.nan_to_num(spread), 1e-12)
+    spread = spread_of(observed)
+    unit = np.ones(len(spread)) if alike else np.maximum(spread, 1e-12)
     return Windows(twin, observed, made_rows[kept], made_first[kept], size, used, unit, unknown)
+
+
+def spread_of(observed: Trajectories) -> NDArray:
+    """Standard deviations (d_y,) of the measured outputs; 0 of one that was never measured."""
+    seen = observed.mask
+    count = np.maximum(seen.sum(axis=(0, 1)), 1)
+    values = np.where(seen, observed.observed, 0.0).astype(np.float64)
+    error = np.where(seen, values - values.sum(axis=(0, 1)) / count, 0.0)
+    return np.asarray(np.sqrt(np.sum(error**2, axis=(0, 1)) / count))
 
 
 def simulated(twin: ParametricTwin, measured: Trajectories, used: NDArray, *, seed: int) -> NDArray:

@@ -12,7 +12,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
 from retwin.twins.wrappers.parametric import ParametricTwin
-from retwin.update.dynamics.windows import sampled, state_based, windows_of
+from retwin.update.dynamics.windows import sampled, spread_of, state_based, windows_of
 
 FOLDS = 4
 """Parts of the record that are left out in turn."""
@@ -116,8 +116,9 @@ def choose_length(observed: Trajectories, fit: Fit, stride: int, *, whole: bool)
     lengths: list[int | None] = [*([None] if whole else []), *horizons]
     if len(lengths) < 2 or not horizons:
         return [Candidate(each, 1.0, 0.0) for each in lengths[:1]]
-    spread = np.nanstd(np.where(observed.mask, observed.observed, np.nan), axis=(0, 1))
+    spread = spread_of(observed)
     spread = np.where(spread > 0, spread, 1.0)
+    spread[~observed.mask.any(axis=(0, 1))] = np.nan
     logs = np.full((len(lengths), FOLDS, 1 + len(horizons)), np.nan)
     scale, warm = (stride, spread), horizons[0]
     for k, part in enumerate(_parts(observed)):
@@ -187,15 +188,17 @@ def _error(
 ) -> float:
     """Logarithm of the RMS error over a horizon, in standard deviations of the outputs.
 
-    NaN where nothing is measured.
+    These are NaN of outputs that were never measured, which do not count. The error is NaN where
+    another one is not measured.
     """
     stride, spread = scale
+    known = np.isfinite(spread)
     error, seen = predictions(twin, left, horizon, stride, warm=warm)
     count = seen.sum(axis=(0, 1))
-    if not count.all():
+    if not count[known].all():
         return float("nan")
-    power = np.sum(np.where(seen, error, 0.0) ** 2, axis=(0, 1)) / count
-    power = np.where(np.isfinite(power), power, np.inf) / spread**2
+    power = np.sum(np.where(seen, error, 0.0) ** 2, axis=(0, 1))[known] / count[known]
+    power = np.where(np.isfinite(power), power, np.inf) / spread[known] ** 2
     return float(np.mean(np.log(np.maximum(power, 1e-300)))) / 2
 
 

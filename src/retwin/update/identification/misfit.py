@@ -53,7 +53,8 @@ class Misfit:
     unit : NDArray
         (d_y,), physical units per unit of a residual.
     spread : float
-        Standard deviation of the twin's outputs over `unit`, the scale of a large residual.
+        Standard deviation of the twin's outputs over `unit`, the scale of a large residual; of
+        those that were measured.
     low, high : NDArray
         (k,), bounds of the parameters.
     present : NDArray
@@ -107,7 +108,8 @@ class Misfit:
         self.unit = np.ones(len(each)) if alike else np.maximum(each, 1e-12)
         if windows is not None:
             self.unit = windows.unit
-        self.spread = float(np.sqrt(np.mean((each / self.unit) ** 2)))
+        known = self.seen.any(axis=(0, 1))
+        self.spread = float(np.sqrt(np.mean((each / self.unit)[known] ** 2)))
 
     @property
     def interval(self) -> float:
