@@ -115,7 +115,7 @@ def test_topics_at_several_rates_are_found_by_their_last_names(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("head", "row", "columns", "said"),
     [
-        ("time,Valve,level", "{t},{k},{k}", {}, "none for valve; .* as retwin identify --column does"),
+        ("time,Valve,level", "{t},{k},{k}", {}, "none for valve; .* identify --column"),
         ("time,a.valve,b.valve,level", "{t},{k},{k},{k}", {}, "got a.valve, b.valve; give"),
         ("valve,level", "{t},{k}", {}, "give --time COLUMN, or --rate HZ"),
         ("time,valve,level [kg]", "{t},{k},{k}", {}, "a unit that is converted to 'm'"),

@@ -315,7 +315,7 @@ def remarks_with(data: rt.Trajectories, **errors: NDArray) -> tuple[str, ...]:
     comparison = Comparison(data, folds, predicted)
     chosen, differences = comparison.simplest()
     scores = [_row(name, comparison, differences, 0.0, "") for name in errors]
-    return remarks_of(twin_of(), data, comparison, scores, chosen, chosen, None)
+    return remarks_of(data, comparison, scores, chosen, chosen, None)
 
 
 def test_a_correction_that_is_better_by_chance_is_said_to_be_so() -> None:

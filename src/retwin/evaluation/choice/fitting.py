@@ -140,7 +140,7 @@ def fit(
         _row(name, comparison, differences, trials.seconds[name], reasons.get(name, ""))
         for name in trials.names
     )
-    remarks = remarks_of(twin, records, comparison, scores, chosen, preferred, horizon)
+    remarks = remarks_of(records, comparison, scores, chosen, preferred, horizon)
     if horizon != settings.horizon:
         remarks = (UNSTABLE.format(horizon), *remarks)
     predicted, deviation = _predictions_of(comparison, chosen)

@@ -12,7 +12,6 @@ from retwin.evaluation.choice.comparison import Comparison
 from retwin.evaluation.choice.fitted import CandidateScore
 from retwin.evaluation.choice.folds import RECORDS
 from retwin.scores.residuals import autocorrelation, ljung_box
-from retwin.twins.twin import Twin
 from retwin.update.forecasts import errors_drift
 
 LONGEST = 0.1
@@ -23,7 +22,6 @@ square is none."""
 
 
 def remarks_of(
-    twin: Twin,
     records: Trajectories,
     comparison: Comparison,
     scores: Sequence[CandidateScore],
