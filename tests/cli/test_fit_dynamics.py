@@ -258,6 +258,7 @@ def test_without_a_method_the_records_decide(folder: Path, tmp_path: Path, call)
     head, first, *_ = bands.read_text().splitlines()
     assert head == "record,time,level_measured,level_mean,level_q05,level_q95"
     low, mean, high = (float(first.split(",")[i]) for i in (4, 3, 5))
+    assert bands.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert low < mean < high
     alone, given = tmp_path / "alone.csv", rt.load(other)
     rows = [f"{t / given.rate},{u:.9g}" for t, u in enumerate(given.commands[0, :, 0])]

@@ -44,7 +44,7 @@ def generate(
         Path | None, option("FILE", "Simulate these commands, in place of drawn ones.")
     ] = None,
     bands: Annotated[
-        bool, option("", "Write mean, 5 % and 95 % quantile of --commands.", "--bands")
+        bool, option("", "Write mean and 90 % band of --commands, also as *.png.", "--bands")
     ] = False,
     per_class: PerClass = 400,
     case: OtherCase = None,
@@ -68,6 +68,7 @@ def generate(
     )
     if bands:
         check_place(out)
+        check_place(out.with_suffix(".png"))
         _write_bands(model, commands, out, case, seed, mapping)  # type: ignore[arg-type]
         return
     kind = check_target(out)
@@ -93,13 +94,20 @@ def generate(
 def _write_bands(
     model: Path, commands: Path, out: Path, case: str | None, seed: int, mapping: Path | None
 ) -> None:
-    """Mean and quantiles of every sample of given commands, as a table."""
+    """Mean and quantiles of every sample of given commands, as a table and of one as a picture."""
     from retwin.evaluation import predict_records
+    from retwin.report.choice.page import draw_prediction
+    from retwin.report.png import png
 
     updated, system = source_of(model, case)
     records = read_commands(commands, system, mapping=mapping)
-    write_predictions(predict_records(updated, records, seed=seed), records, out)
+    found = predict_records(updated, records, seed=seed)
+    write_predictions(found, records, out)
+    picture = png(draw_prediction(records, found.mean, found.deviation), emulated=records.emulated)
+    with write_atomically(out.with_suffix(".png")) as part:
+        part.write_bytes(picture)
     note(f"Wrote mean and 90 % bands of {len(records)} records to {out}")
+    note(f"Wrote {out.with_suffix('.png')}, the first of them")
 
 
 def write_predictions(found: ScoredPrediction, records: Trajectories, out: Path) -> None:

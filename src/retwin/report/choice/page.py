@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from retwin.data.trajectories import Trajectories
 from retwin.evaluation.choice.fitted import Fitted
 from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Table, tabulate
@@ -15,7 +17,7 @@ from retwin.report.labels import significant
 from retwin.report.records import TITLE, records_part
 from retwin.update.forecast_errors import USUAL
 
-MEASURED, PREDICTED = "ink", "c0"
+MEASURED, PREDICTED = "muted", "c0"
 
 
 def fit_page(found: Fitted, folder: str, *, title: str) -> str:
@@ -74,23 +76,29 @@ def _bands(found: Fitted) -> Table:
 
 def _predictions(found: Fitted) -> Figure:
     """Measured and predicted outputs of the record of which most was left out."""
-    records = found.records
-    known = np.isfinite(found.predicted)
-    row = int(np.argmax(known.any(axis=2).sum(axis=1)))
+    row = int(np.argmax(np.isfinite(found.predicted).any(axis=2).sum(axis=1)))
+    return draw_prediction(found.records, found.predicted, found.deviation, row)
+
+
+def draw_prediction(
+    records: Trajectories, mean: NDArray, deviation: NDArray, row: int = 0
+) -> Figure:
+    """Predictions (n, T, d_y) of one of some records with 90 % bands, and what was measured."""
     last = int(records.lengths[row])
     chosen = np.arange(0, last, max(1, -(-last // SAMPLES)))
-    times = chosen / records.rate
+    times, measured = chosen / records.rate, bool(records.mask[row].any())
     panels = []
     for i in range(min(OUTPUTS, len(records.outputs))):
         seen = records.mask[row, chosen, i]
         values = np.where(seen, records.observed[row, chosen, i], np.nan)
-        mean, deviation = found.predicted[row, chosen, i], found.deviation[row, chosen, i]
+        own, half = mean[row, chosen, i], USUAL * deviation[row, chosen, i]
         marks: list[Mark] = [
-            Band(times, mean - USUAL * deviation, mean + USUAL * deviation, "90 % band", PREDICTED),
-            Line(times, values, "measured", MEASURED, width=2.2, alpha=0.5),
-            Line(times, mean, "predicted", PREDICTED, width=1.6),
+            Band(times, own - half, own + half, "90 % band", PREDICTED),
+            Line(times, values, "measured", MEASURED, width=2.2),
+            Line(times, own, "predicted", PREDICTED, width=1.6),
         ]
         name, unit = records.outputs.names[i], records.outputs.units[i]
         panels.append(record_panel(times, name, unit, marks))
     keys = [Key("measured", MEASURED), Key("predicted, with its 90 % band", PREDICTED)]
+    keys = keys if measured else keys[1:]
     return Figure("predictions", panels, keys, str(records.ids[row]), columns=1)
