@@ -188,7 +188,9 @@ CLEAR = 0.01
 
 
 def _verdict(scores: list[ModelScore]) -> list[str]:
-    """What is better than the model, in sentences."""
+    """What is better than the model, and whether its bands hold, in sentences."""
+    from retwin.scores.uses import COVERAGE
+
     made = []
     words = {"twin": "the twin before its update", "mean": "the mean of the record itself"}
     words["hold"] = "the first sample" if scores[0].horizon is None else "the last measured sample"
@@ -197,4 +199,10 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
             own = next(s for s in scores if s.who == "model" and s.output == each.output)
             if each.rmse < (1 - CLEAR) * own.rmse:
                 made.append(f"{each.output}: {words[each.who]} is a better prediction.")
+        elif each.coverage < COVERAGE[0]:
+            made.append(
+                f"{each.output}: the 90 % band holds {each.coverage:.0%} of these samples: do not "
+                "rely on it here. These records may be few, of another day, or begin in other "
+                "states than the twin: identify it without the begin of records, --transient."
+            )
     return made

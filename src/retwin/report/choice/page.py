@@ -84,9 +84,10 @@ def draw_prediction(
     records: Trajectories, mean: NDArray, deviation: NDArray, row: int = 0
 ) -> Figure:
     """Predictions (n, T, d_y) of one of some records with 90 % bands, and what was measured."""
-    last = int(records.lengths[row])
-    chosen = np.arange(0, last, max(1, -(-last // SAMPLES)))
-    times, measured = chosen / records.rate, bool(records.mask[row].any())
+    last, seen = int(records.lengths[row]), records.mask[row].any(axis=1)
+    first, measured = int(np.argmax(seen)), bool(seen.any())  # after a transient
+    chosen = np.arange(first, last, max(1, -(-(last - first) // SAMPLES)))
+    times = chosen / records.rate
     panels = []
     for i in range(min(OUTPUTS, len(records.outputs))):
         seen = records.mask[row, chosen, i]

@@ -134,6 +134,7 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
     ]
     strong = [f"{a} and {b} ({signed(r, 2)})" for a, b, r in pairs if abs(r) > STRONG]
     means = {each.name: each.mean for each in found.outputs}
+    measured = found.simulated["identification"][0]
     return sentences(
         "findings",
         found=found,
@@ -155,6 +156,8 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
         whole=next((each.error for each in horizons if each.length is None), None),
         settable=state_based(found.twin),
         larger=[pair for pair in found.begin_errors.items() if pair[1] > ELSEWHERE],
+        tenth=measured.lengths.max() / measured.rate / 10,
+        started=any(each.name.startswith("start_") for each in found.parameters),
         unknown=[p for p in found.parameters if not (p.identified or p.at_bound or p.depends)],
         depending=[each.name for each in found.parameters if each.depends],
         strong=strong[:SENTENCES],
