@@ -146,6 +146,30 @@ def test_bands_hold_what_they_promise_of_other_records() -> None:
 
 
 @pytest.mark.slow
+def test_bands_hold_where_records_begin_in_other_states() -> None:
+    """The band is wide at the start alone: its mean square says nothing of the time after it."""
+    twin = twin_of()
+    states = (State("heat", "K", low=-20.0, high=20.0),)
+    twin = StateTwin(
+        states, lambda x, u, p: x.heat, INPUTS, OUTPUTS, 1.0,
+        derivative=lambda x, u, p: (p.gain * u.power - p.loss * x.heat,),
+        parameters=twin.parameters,
+    )  # fmt: skip
+
+    def begun(*seeds: int) -> rt.Trajectories:
+        data = records(*seeds, slope=radiating, steps=300)
+        start = np.random.default_rng(seeds).uniform(-8, 8, size=(len(seeds), 1, 1))
+        decay = start * np.exp(-0.12 * np.arange(300))[None, :, None]
+        return data.replace(observed=data.observed + decay)
+
+    found = rt.fit(twin, begun(1, 2, 3, 4, 5), rt.Choice(method="dynamics", candidates=FAST))
+    fresh = begun(11, 12, 13)
+    held = predict_records(found.twin, fresh)
+    later = np.abs(fresh.observed - held.mean)[:, 60:] <= 1.645 * held.deviation[:, 60:]
+    assert later.mean() > 0.85
+
+
+@pytest.mark.slow
 def test_models_without_the_twin_are_compared_on_the_same_parts(tmp_path: Path) -> None:
     data = records(0, slope=radiating)
     twin = rt.FunctionTwin(lambda u: 3.0 * u, INPUTS, OUTPUTS, 1.0)

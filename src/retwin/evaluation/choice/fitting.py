@@ -36,7 +36,7 @@ from retwin.update.corrections import Additive, DelayOffset
 from retwin.update.corrections.machines import OtherMachines
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
-from retwin.update.forecast_errors import ForecastErrors
+from retwin.update.forecast_errors import ForecastErrors, predictive_deviation
 from retwin.update.forecasts import (
     LEADS,
     LeftOut,
@@ -257,14 +257,23 @@ def _calibrate(model: Model, trials: Trials, name: str, comparison: Comparison) 
         part = (forecasts(one, own, leads), free, own, fold.held[fold.rows])
         found.append(LeftOut(*part, fold.excess(records), fold.edge))
     forecast = calibrate_forecasts(records, found, leads)
-    if comparison.constant[name].any():
+    constant = comparison.constant[name]
+    if constant.any():
         assert isinstance(model, DynamicsTwin)
-        constant = np.where(comparison.constant[name], forecast.deviation[-1], 0.0)
-        model = replace(model, constant=constant)
-    deviation = np.where(records.mask, free_moments(model, records.commands)[1], np.nan)
-    with np.errstate(invalid="ignore"):
-        size = np.sqrt(np.nanmean(deviation**2, axis=(0, 1)))
-    factors = np.divide(forecast.deviation[-1], size, out=np.ones_like(size), where=size > 0)
+        model = replace(model, constant=np.where(constant, forecast.deviation[-1], 0.0))
+    # Deviations change with time, as from an unknown start on: errors are compared with each.
+    deviation, ratios = free_moments(model, records.commands)[1], []
+    for each, fold in zip(found, trials.folds, strict=True):
+        seen = each.record.mask & each.held[..., None] & (not each.edge)
+        known = seen & (deviation[fold.rows] > 0)
+        error = np.where(known, np.abs(each.record.observed - each.free), np.nan)
+        ratios.append(
+            (error / np.where(known, deviation[fold.rows], 1.0)).reshape(-1, len(constant))
+        )
+    every, factors = np.concatenate(ratios), np.ones(len(constant))
+    for i in np.flatnonzero(~constant & np.isfinite(every).any(axis=0)):
+        own_ratios = every[np.isfinite(every[:, i]), i]
+        factors[i] = predictive_deviation(own_ratios, float(forecast.independent[-1, i]))
     return widened(model, factors, forecast)
 
 
