@@ -23,7 +23,7 @@ from retwin.cli.options import (
     rare,
     seconds_of,
 )
-from retwin.cli.reading import shown_records
+from retwin.cli.reading import log_reader, shown_records
 from retwin.cli.terminal import answer, bar, command_given, note, table
 from retwin.serialisation.places import check_place
 
@@ -104,7 +104,7 @@ def identify(
     case, updated.toml. A module that is named by the twin or its case is run
     with your rights.
     """
-    from retwin.cases import LogReader
+    from retwin.cases import Columns, LogReader
     from retwin.deploy.identified import HOLDS, save_identification
     from retwin.evaluation import identification as room
     from retwin.twins import keep_workers
@@ -121,6 +121,8 @@ def identify(
         existing("LOG", log, log.exists())
     reader = LogReader(columns, max_bytes)
     opened, left_out = _opened(twin, logs, reader, free or (), names, rate)
+    if columns == Columns() and opened.case is not None:
+        reader = log_reader(logs[0], opened.case, opened.twin, max_bytes)
     with keep_workers(), bar("identify") as show:
         read = reader.trajectories(
             logs,

@@ -159,7 +159,7 @@ def _read(
     divided = log and getattr(case, "records", None) is not None
     twin: Any = getattr(case, "twin", None)
     if divided or (log and is_log(file) and twin is not None):
-        reader = _log_reader(file, case, twin, max_bytes)
+        reader = log_reader(file, case, twin, max_bytes)
         if divided and is_log(file):  # one with the names of the channels is read by these
             divided = not _names_channels(file, twin, max_bytes)
         own = case if divided else None
@@ -181,7 +181,7 @@ def _read(
         )
 
 
-def _log_reader(file: Path, case: Any, twin: Twin, max_bytes: int | None = None) -> LogReader:
+def log_reader(file: Path, case: Any, twin: Twin, max_bytes: int | None = None) -> LogReader:
     """A reader of a log by the names of the channels, else by the columns that the case states."""
     from retwin.cases import Columns, LogReader
 
@@ -230,7 +230,7 @@ def read_commands(file: Path, case: Case, *, mapping: Path | None = None) -> Tra
     from retwin.twins import FunctionTwin
 
     twin, table = case.twin, mapping is None and file.is_file() and is_log(file)
-    if not table or _log_reader(file, case, twin).measured_outputs([file], twin):
+    if not table or log_reader(file, case, twin).measured_outputs([file], twin):
         return read(file, case, mapping=mapping)
     # A twin whose outputs are its commands, so that no output is missing.
     alone = FunctionTwin(lambda u: u, rate=twin.rate, inputs=twin.inputs, outputs=twin.inputs)

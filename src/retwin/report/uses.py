@@ -42,7 +42,7 @@ def use_rows(results: Results) -> list[UseRow]:
     return [
         UseRow(
             TITLES[use.use],
-            _required(use.use, classes=bool(results.classes)),
+            _state_requirement(use.use, classes=bool(results.classes)),
             use.answer,
             "on emulated data" if results.emulated and use.answer != "cannot say" else "",
             source_name(use.source) if use.source else "",
@@ -53,7 +53,7 @@ def use_rows(results: Results) -> list[UseRow]:
     ]
 
 
-def _required(use: str, *, classes: bool) -> str:
+def _state_requirement(use: str, *, classes: bool) -> str:
     """What a use requires, of a study with or without classes."""
     error, bands = "a smaller error than the original twin's", f"90 % bands that hold {BANDS}"
     if not classes and use in ("training", "monitor"):

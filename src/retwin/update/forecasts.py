@@ -218,12 +218,10 @@ def calibrate_forecasts(
     width = known[0].shape[2]
     low, high = value_range(np.concatenate([each.reshape(1, -1, width) for each in known], axis=1))
     free = [_errors(part, len(leads))[0] for part in found if not part.edge]
-    longest, drifts = (
-        float(records.lengths.max() / records.rate),
-        errors_drift(np.concatenate(free)),
-    )
-    rows_by_lead = (times, persistence, deviation, independent)
-    return ForecastErrors(*rows_by_lead, memory, low, high, beyond, longest, drifts)
+    by_lead = times, persistence, deviation, independent
+    longest = float(records.lengths.max() / records.rate)
+    drifts = errors_drift(np.concatenate(free))
+    return ForecastErrors(*by_lead, memory, low, high, beyond, longest, drifts)
 
 
 def errors_drift(errors: NDArray) -> bool:

@@ -45,14 +45,14 @@ def remarks_of(
             f"from fewer than {RECORDS} records, of which whole ones are left out."
         )
     if preferred in ("none", "parameters"):
-        made += _uncorrected(comparison, by_name, preferred, free=horizon is None)
+        made += _describe_uncorrected(comparison, by_name, preferred, free=horizon is None)
     baseline = "parameters" if "parameters" in comparison.predicted else "none"
     if baseline in comparison.predicted and horizon is None:
         made += _of_twin(records, comparison, baseline)
     return tuple(made)
 
 
-def _uncorrected(
+def _describe_uncorrected(
     comparison: Comparison, scores: Mapping[str, CandidateScore], name: str, *, free: bool
 ) -> list[str]:
     """How much better corrections are than the twin, and whether its errors are no noise.

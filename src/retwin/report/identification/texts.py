@@ -8,6 +8,7 @@ from math import isfinite, isnan
 from retwin.cases.measured import CONSTANT
 from retwin.evaluation.identification import Direction, Identification, ParameterEstimate, RMSError
 from retwin.evaluation.identification.parameters import WIDEST
+from retwin.evaluation.identification.validation import BEGIN
 from retwin.report.assets import sentences
 from retwin.report.labels import behind, signed, significant
 from retwin.update.dynamics.windows import state_based
@@ -156,7 +157,7 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
         whole=next((each.error for each in horizons if each.length is None), None),
         settable=state_based(found.twin),
         larger=[pair for pair in found.begin_errors.items() if pair[1] > ELSEWHERE],
-        tenth=measured.lengths.max() / measured.rate / 10,
+        tenth=measured.lengths.max() / measured.rate / BEGIN,
         started=any(each.name.startswith("start_") for each in found.parameters),
         unknown=[p for p in found.parameters if not (p.identified or p.at_bound or p.depends)],
         depending=[each.name for each in found.parameters if each.depends],

@@ -358,7 +358,7 @@ def _identifiability(
     weight = np.sqrt(curvature)[once]
     errors = width * standard_errors(jacobian[once] * weight[..., None], gradient[once] / weight)
     # Where noise is to be the same in all samples of an output, their weights must be so.
-    weight = np.sqrt(search.averaged(curvature))
+    weight = np.sqrt(search.average_curvature(curvature))
     jacobian, residual = jacobian * weight[..., None], gradient / weight
     jacobian, residual, seen = jacobian[once], residual[once], misfit.seen[once]
     # As well as the best: within the 95 % range of the objective under noise (chi-square).

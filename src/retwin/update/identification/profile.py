@@ -114,7 +114,7 @@ def profile(
         grid = np.unique(np.append(np.linspace(low, high, points), best[which]))
         sums = _profile_sums(search, which, grid, best)
         _, gradient, curvature = search.linearised(misfit.residuals(search.theta(best[None]))[0])
-        residual = gradient / np.sqrt(search.averaged(curvature))
+        residual = gradient / np.sqrt(search.average_curvature(curvature))
         noise = variance_of(residual, int(misfit.seen.sum()), len(names))
         noise *= (error / local.white[which]) ** 2 if np.isfinite(error) else 1.0
     return Profile(

@@ -309,12 +309,12 @@ class Search:
             total, gradient, curvature = 2 * np.sum(root - 1), residual / root, root**-3
         elif self.loss == "cauchy":
             total, gradient = np.sum(np.log1p(square)), residual / (1 + square)
-            curvature = self.averaged((1 - square) / (1 + square) ** 2)
+            curvature = self.average_curvature((1 - square) / (1 + square) ** 2)
         else:
             return float(np.sum(residual**2)), residual, np.ones_like(residual)
         return float(self.scale**2 * total), gradient, curvature
 
-    def averaged(self, curvature: NDArray) -> NDArray:
+    def average_curvature(self, curvature: NDArray) -> NDArray:
         """The mean curvature over the samples of each output, in the place of each (n, P, d_y)."""
         seen = np.broadcast_to(self.misfit.seen, curvature.shape)
         count = np.maximum(seen.sum(axis=(0, 1)), 1)
