@@ -42,7 +42,7 @@ class Checked:
         """How much of the variance nominal outputs explain, in a sentence; none where unknown."""
         parts = []
         for kind, shares in self._known.items():
-            own = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in shares.items())
+            own = ", ".join(_explained(name, share) for name, share in shares.items())
             which = "" if len(self.explained) == 1 else f" in {kind} records"
             parts += [f"{own}{which}"] * bool(own)
         return [f"The twin as it was given explains {'; '.join(parts)} (variance)."] * bool(parts)
@@ -116,3 +116,8 @@ def doubtful(records: Trajectories) -> str:
     """
     every = readings_of(records, samples=1)
     return "; ".join(summarise(found for each in every for found in find_constant(each)))
+
+
+def _explained(output: str, share: float) -> str:
+    """What is explained of an output, in words where it is less than nothing."""
+    return f"{100 * share:.0f} % of {output}" if share >= 0 else f"less of {output} than its mean"

@@ -242,7 +242,8 @@ def _names(candidates: Candidates, settings: Choice) -> list[str]:
         remedy="dynamics need a StateTwin, or a state surrogate of the twin; a delay and an offset "
         "commands that move and rest",
     )
-    return names
+    simpler = settings.method and not settings.candidates
+    return names[: names.index(settings.method) + 1] if simpler else names
 
 
 def _calibrate(model: Model, trials: Trials, name: str, comparison: Comparison) -> Model:

@@ -43,7 +43,7 @@ class Choice:
     ----------
     candidates : sequence of str
         Keys of `retwin.catalog.CANDIDATES` that are compared, the simplest first; by default all
-        that the twin and the records allow.
+        that the twin and the records allow, and with a `method` those that are simpler than it.
     method : str
         The candidate that is taken whatever the comparison shows; by default the one that it shows.
     horizon : float, optional
