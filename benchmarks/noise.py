@@ -28,7 +28,7 @@ from retwin.cases.styrofoam_incubator.case import measurements
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update import fit_dynamics
-from retwin.update.dynamics.noise_search import Search, SearchSettings, Visited
+from retwin.update.dynamics.filter.noise_search import Search, SearchSettings, Visited
 
 WAYS = {
     "simplices": SearchSettings(climbs=(), points=16, rough=-np.inf, simplex=(1, 0.3)),

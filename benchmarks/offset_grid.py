@@ -28,8 +28,8 @@ from retwin.cases.armpi_fpv.case import ArmSampler
 from retwin.cases.armpi_fpv.emulator import EmulatedArmPi
 from retwin.cases.armpi_fpv.twin import UNIT, ArmPiTwin
 from retwin.update.corrections import fit_correction
-from retwin.update.corrections.command_problem import CommandProblem
-from retwin.update.corrections.offset_features import OffsetFeatures
+from retwin.update.corrections.commands.offset_features import OffsetFeatures
+from retwin.update.corrections.commands.problem import CommandProblem
 
 SEGMENTS = 400
 LEVEL = 0.9

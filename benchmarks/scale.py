@@ -25,7 +25,7 @@ from record import record, timed
 import retwin as rt
 from retwin import twins
 from retwin.deploy.simulations import SimulationPlan, simulate_to
-from retwin.diagnosis.features import Features
+from retwin.diagnosis.trained.features import Features
 
 MILLION = 1_000_000
 COUNT = 1024

@@ -20,8 +20,8 @@ from torch import nn
 from torch.utils.data import DataLoader, TensorDataset
 
 import retwin as rt
-from retwin.diagnosis.features import Features, class_index
-from retwin.diagnosis.network import training_for
+from retwin.diagnosis.trained.features import Features, class_index
+from retwin.diagnosis.trained.network import training_for
 from retwin.nets.networks import Network
 
 SEEDS = 3

@@ -181,17 +181,21 @@ NETWORKS: Mapping[str, Entry] = {
 CLASSIFIERS: Mapping[str, Entry] = {
     "cnn": Entry("retwin.nets.networks:CNN", "convolutional network"),
     "lstm": Entry("retwin.nets.networks:LSTMClassifier", "LSTM, last step (the paper's)"),
-    "rocket": Entry("retwin.diagnosis.rocket:Rocket", "MiniRocket and a ridge", "rocket"),
+    "rocket": Entry("retwin.diagnosis.trained.rocket:Rocket", "MiniRocket and a ridge", "rocket"),
 }
 """Classifiers that are trained on generated trajectories."""
 
 DIAGNOSERS: Mapping[str, Entry] = {
-    "diagnoser": Entry("retwin.diagnosis.network:NetworkDiagnoser", "neural network"),
-    "inversion": Entry("retwin.diagnosis.inversion:InversionDiagnoser", "fault inversion"),
-    "state inversion": Entry(
-        "retwin.diagnosis.state_inversion:StateInversionDiagnoser", "fault inversion with states"
+    "diagnoser": Entry("retwin.diagnosis.trained.network:NetworkDiagnoser", "neural network"),
+    "inversion": Entry(
+        "retwin.diagnosis.inversion.trajectories:InversionDiagnoser", "fault inversion"
     ),
-    "rocket": Entry("retwin.diagnosis.rocket:RocketDiagnoser", "MiniRocket and a ridge", "rocket"),
+    "state inversion": Entry(
+        "retwin.diagnosis.inversion.states:StateInversionDiagnoser", "fault inversion with states"
+    ),
+    "rocket": Entry(
+        "retwin.diagnosis.trained.rocket:RocketDiagnoser", "MiniRocket and a ridge", "rocket"
+    ),
 }
 """By the kind in the model.json of a saved diagnoser: the class whose `load` reads it."""
 

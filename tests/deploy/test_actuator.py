@@ -20,7 +20,7 @@ import retwin as rt
 from retwin.deploy import export_actuator
 from retwin.errors import InputError
 from retwin.update.corrections import Chain, SampledSensor
-from retwin.update.corrections.effective_commands import effective_commands
+from retwin.update.corrections.commands.effective_commands import effective_commands
 from retwin.update.residual import SequenceMixture
 from retwin.update.residual.sequence import SequenceResidual
 

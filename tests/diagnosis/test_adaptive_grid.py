@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from retwin.diagnosis.adaptive_grid import integrate
+from retwin.diagnosis.inversion.adaptive_grid import integrate
 
 
 def gaussian(points: np.ndarray, mean: float, deviation: float) -> np.ndarray:

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import retwin as rt
-from retwin.diagnosis.adversarial import _Pair, _reverse
-from retwin.diagnosis.features import Features
+from retwin.diagnosis.trained.adversarial import _Pair, _reverse
+from retwin.diagnosis.trained.features import Features
 from retwin.nets.training import Training
 from retwin.testing import check_diagnoser
 

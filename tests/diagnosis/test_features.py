@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.diagnosis.features import Features, class_order
+from retwin.diagnosis.trained.features import Features, class_order
 
 
 def ramp(count: int, onset: int, length: int, steps: int = 400) -> rt.Trajectories:

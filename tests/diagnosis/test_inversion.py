@@ -17,10 +17,10 @@ from torch import Tensor
 
 import retwin as rt
 from retwin.diagnosis import Calibration, Diagnosis, InversionDiagnoser, conclude, fit_inversion
-from retwin.diagnosis.hypotheses import stuck_pairs
-from retwin.diagnosis.inversion import UNEXPLAINED
-from retwin.diagnosis.inversion_fitting import lower_bound
-from retwin.diagnosis.severity import draw_biases
+from retwin.diagnosis.inversion.fitting import lower_bound
+from retwin.diagnosis.inversion.hypotheses import stuck_pairs
+from retwin.diagnosis.inversion.severity import draw_biases
+from retwin.diagnosis.inversion.trajectories import UNEXPLAINED
 from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
@@ -30,9 +30,9 @@ from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
 from retwin.twins.commands.samplers import RampSampler
 from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_from
 from retwin.twins.faults.system_faults import ActuatorGain
-from retwin.update.corrections.command_problem import CommandProblem
-from retwin.update.corrections.effective_commands import effective_commands
-from retwin.update.corrections.missed_segments import LatentPrior, fitted
+from retwin.update.corrections.commands.effective_commands import effective_commands
+from retwin.update.corrections.commands.missed_segments import LatentPrior, fitted
+from retwin.update.corrections.commands.problem import CommandProblem
 
 pytestmark = pytest.mark.slow
 

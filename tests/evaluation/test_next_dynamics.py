@@ -11,7 +11,7 @@ from retwin.evaluation.experiments.dynamics import DynamicsKnowledge
 from retwin.evaluation.experiments.propose import next_experiments
 from retwin.inference.design import chosen
 from retwin.twins import Parameter, State, StateTwin
-from retwin.update.dynamics.domain import Domain
+from retwin.update.dynamics.discrepancy.domain import Domain
 from retwin.update.dynamics.twin import DynamicsTwin
 
 NOISE, POSTERIOR = 0.01, np.diag([0.2, 0.3, 0.0])

@@ -20,17 +20,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import retwin as rt
-from retwin.diagnosis.hypotheses import Hypotheses
-from retwin.diagnosis.inversion import Inversion, invert
+from retwin.diagnosis.inversion.hypotheses import Hypotheses
+from retwin.diagnosis.inversion.trajectories import Inversion, invert
 from retwin.inference.losses import Tukey
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
 from retwin.inference.solver import Solution, solve
-from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.commands.missed_segments import fitted
+from retwin.update.corrections.commands.offset_features import WIDE
+from retwin.update.corrections.commands.path_problem import PathProblem
+from retwin.update.corrections.commands.problem import CommandProblem
 from retwin.update.corrections.delay_offset import _learned
-from retwin.update.corrections.missed_segments import fitted
-from retwin.update.corrections.offset_features import WIDE
-from retwin.update.corrections.path_problem import PathProblem
 
 pytestmark = pytest.mark.numerical
 

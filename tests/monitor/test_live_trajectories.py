@@ -20,7 +20,7 @@ from collecting import running, wait
 from monitor.test_trajectory_monitor import TANK, runs
 
 import retwin as rt
-from retwin.diagnosis.state_inversion import StateInversionDiagnoser
+from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor import Explanations, Gate, Live, Registry, Samples, Store, export_log, verify
 from retwin.monitor.live.machine import Counts

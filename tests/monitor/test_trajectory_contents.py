@@ -7,7 +7,7 @@ import pytest
 from monitor.test_trajectory_monitor import TANK, runs
 
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.state_inversion import StateInversionDiagnoser
+from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor.detect.offsets import OffsetModel, fit_offsets
 from retwin.monitor.models.trajectories import TrajectoryMonitor

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.diagnosis.state_inversion import StateInversionDiagnoser
+from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor.models.trajectories import TrajectoryMonitor
 from retwin.monitor.models.trajectory_fitting import fit_trajectory_monitor

@@ -9,7 +9,7 @@ import pytest
 from monitor.test_live_trajectories import APART, BEGIN, trajectories
 from monitor.test_trajectory_monitor import NOISE, TANK, runs
 
-from retwin.diagnosis.state_inversion import StateInversionDiagnoser
+from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor import Live, Registry, Store, compare, fit_monitor, verify
 from retwin.monitor.models.trajectories import TrajectoryMonitor

@@ -15,7 +15,7 @@ from retwin.errors import InputError
 from retwin.twins import Parameter, ParameterShift, State, StateTwin
 from retwin.twins.equations.interpolation import INTERPOLATIONS
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
-from retwin.update.dynamics.online import OnlineFilter
+from retwin.update.dynamics.filter.online import OnlineFilter
 
 RATE = 10.0
 DEAD = np.array([0.0, 0.31, 0.77])

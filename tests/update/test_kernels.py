@@ -18,9 +18,9 @@ from retwin.twins.compiled import commands as compiled_commands
 from retwin.twins.faults.actuator_faults import ActuatorBias
 from retwin.twins.faults.applied_faults import faulty_commands
 from retwin.update.corrections import Context
-from retwin.update.corrections.command_problem import CommandProblem
-from retwin.update.corrections.effective_commands import effective_commands
-from retwin.update.corrections.path_problem import path_at
+from retwin.update.corrections.commands.effective_commands import effective_commands
+from retwin.update.corrections.commands.path_problem import path_at
+from retwin.update.corrections.commands.problem import CommandProblem
 from retwin.update.corrections.sampled_sensor import SampledSensor
 from retwin.update.kernels import generation
 from retwin.update.piecewise_linear import evaluate_piecewise_linear

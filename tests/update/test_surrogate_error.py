@@ -14,7 +14,7 @@ from retwin.data.segments import Segments
 from retwin.nets.training import Training
 from retwin.twins import RampSampler, TwinWrapper
 from retwin.update import OutsideTrainingWarning
-from retwin.update.corrections.effective_commands import effective_commands
+from retwin.update.corrections.commands.effective_commands import effective_commands
 from retwin.update.surrogate_error import surrogate_variance
 
 pytestmark = pytest.mark.slow

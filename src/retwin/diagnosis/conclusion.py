@@ -11,8 +11,8 @@ from retwin.checks import one_of, require
 from retwin.data.measured import unmeasured_outputs
 from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.diagnoser import Diagnoser
-from retwin.diagnosis.inversion import Diagnosis, InversionDiagnoser
-from retwin.diagnosis.state_inversion import StateDiagnosis, StateInversionDiagnoser
+from retwin.diagnosis.inversion.states import StateDiagnosis, StateInversionDiagnoser
+from retwin.diagnosis.inversion.trajectories import Diagnosis, InversionDiagnoser
 from retwin.progress import Progress
 
 

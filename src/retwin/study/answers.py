@@ -14,7 +14,7 @@ from retwin.catalog import SOURCES, metrics_with
 from retwin.data.quality.finding import Finding
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.labels import find_wrong_labels
-from retwin.diagnosis.pooled import pool_probabilities
+from retwin.diagnosis.trained.pooled import pool_probabilities
 from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
 from retwin.scores.bootstrap import Draws, Resampling, bootstrap_means
 from retwin.scores.classification import METRICS, confusion, score

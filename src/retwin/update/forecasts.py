@@ -17,7 +17,7 @@ from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive
 from retwin.update.dynamics.estimation import correlation_time
-from retwin.update.dynamics.filtering import arrays_of
+from retwin.update.dynamics.filter.filtering import arrays_of
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.forecast_errors import (
     BEYOND,

@@ -23,7 +23,7 @@ from retwin.deploy.onnx import session
 from retwin.deploy.onnx.export import PARITY, export_onnx
 from retwin.deploy.onnx.graphs import FeaturesGraph, SensorGraph
 from retwin.deploy.onnx.portable import Portable, settled_at
-from retwin.diagnosis.features import SETTLED, Features
+from retwin.diagnosis.trained.features import SETTLED, Features
 from retwin.serialisation import sizes
 from retwin.update.corrected import CorrectedTwin
 

@@ -17,8 +17,8 @@ from retwin.cases.armpi_fpv.twin import KINEMATIC, RATE, SENSOR_RATE
 from retwin.errors import InputError
 from retwin.serialisation.configs import from_config, to_config
 from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_from
-from retwin.update.corrections.command_problem import CommandProblem
-from retwin.update.corrections.effective_commands import effective_commands
+from retwin.update.corrections.commands.effective_commands import effective_commands
+from retwin.update.corrections.commands.problem import CommandProblem
 
 POLL = round(RATE / SENSOR_RATE)
 

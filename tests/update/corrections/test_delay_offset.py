@@ -8,7 +8,7 @@ import retwin as rt
 from retwin import catalog
 from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.serialisation.configs import from_config, to_config
-from retwin.update.corrections.path_problem import PathProblem
+from retwin.update.corrections.commands.path_problem import PathProblem
 from retwin.update.kernels import generation
 
 KINDS = catalog.classes(catalog.CORRECTIONS)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 import retwin as rt
 from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise
-from retwin.update.corrections.command_problem import COMMON_ERROR, CommandProblem
-from retwin.update.corrections.offset_features import OffsetFeatures
+from retwin.update.corrections.commands.offset_features import OffsetFeatures
+from retwin.update.corrections.commands.problem import COMMON_ERROR, CommandProblem
 
 RATE = 50.0
 OPERATORS = (rt.DelayOffset, rt.CommandSpace)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import retwin as rt
 from retwin.inference.noise import Noise
-from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.commands.problem import CommandProblem
 from retwin.update.corrections.sample_noise import SampleNoise
 
 pytestmark = pytest.mark.numerical

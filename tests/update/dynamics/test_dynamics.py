@@ -22,8 +22,8 @@ from retwin.twins.equations.saved_equations import equations_from, equations_of
 from retwin.update import Dynamics, DynamicsTwin, Library, OutsideTrainingWarning, fit_dynamics
 from retwin.update.dynamics import FittedDynamics
 from retwin.update.dynamics.estimation import correlation_time
-from retwin.update.dynamics.noise import needed_factor
-from retwin.update.dynamics.prediction import Prediction, log_density
+from retwin.update.dynamics.filter.noise import needed_factor
+from retwin.update.dynamics.filter.prediction import Prediction, log_density
 
 pytestmark = pytest.mark.slow
 

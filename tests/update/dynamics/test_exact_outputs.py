@@ -10,7 +10,7 @@ import pytest
 import retwin as rt
 from retwin.twins import State, StateTwin
 from retwin.twins.compiled import steps
-from retwin.update.dynamics.prediction import Prediction
+from retwin.update.dynamics.filter.prediction import Prediction
 
 FORCE = rt.Channels(("force",), ("N",))
 POSITION = rt.Channels(("y",), ("m",))

@@ -16,10 +16,10 @@ from retwin.errors import InputError
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update import Dynamics, DynamicsTwin, FittedDynamics, Library, TanhNetwork, fit_dynamics
 from retwin.update.dynamics.arrow import Arrow, bounded_step
-from retwin.update.dynamics.corrected import CorrectedEquations
+from retwin.update.dynamics.discrepancy.equations import CorrectedEquations
 from retwin.update.dynamics.estimation import Estimation
+from retwin.update.dynamics.filter.noise import edges
 from retwin.update.dynamics.linearised import Point
-from retwin.update.dynamics.noise import edges
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 
 pytestmark = pytest.mark.slow

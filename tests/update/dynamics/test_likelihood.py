@@ -11,8 +11,8 @@ import torch
 import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update.dynamics import DynamicsTwin, likelihood
-from retwin.update.dynamics.domain import Domain
-from retwin.update.dynamics.likelihood import Record, Variants
+from retwin.update.dynamics.discrepancy.domain import Domain
+from retwin.update.dynamics.filter.likelihood import Record, Variants
 
 SAMPLES, COUNT = 60, 11
 RNG = np.random.default_rng(0)

@@ -11,8 +11,8 @@ import pytest
 import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update import Dynamics, FittedDynamics, Library, fit_dynamics
-from retwin.update.dynamics.corrected import CorrectedEquations
-from retwin.update.dynamics.memory import Memory, with_memories
+from retwin.update.dynamics.discrepancy.equations import CorrectedEquations
+from retwin.update.dynamics.discrepancy.memory import Memory, with_memories
 
 RATE = 0.1
 SLOW = 600.0

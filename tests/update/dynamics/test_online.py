@@ -11,7 +11,7 @@ import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
 from retwin.twins.compiled import steps
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
-from retwin.update.dynamics.online import FilterState, OnlineFilter
+from retwin.update.dynamics.filter.online import FilterState, OnlineFilter
 
 TWIN = StateTwin(
     (State("x", "m", 0.0, -1.0, 1.0), State("v", "m/s")),

@@ -12,9 +12,9 @@ from safetensors.numpy import load_file, save_file
 import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
-from retwin.update.dynamics.noise import fit_noise, folds
-from retwin.update.dynamics.noise_search import Search
-from retwin.update.dynamics.online import OnlineFilter
+from retwin.update.dynamics.filter.noise import fit_noise, folds
+from retwin.update.dynamics.filter.noise_search import Search
+from retwin.update.dynamics.filter.online import OnlineFilter
 
 LAG = StateTwin(
     (State("x", "m"),),

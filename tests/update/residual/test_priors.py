@@ -11,7 +11,7 @@ import torch
 import retwin as rt
 from retwin.errors import InputError
 from retwin.inference.hyperprior import Variances
-from retwin.update.corrections.machines import OtherMachines
+from retwin.update.corrections.commands.machines import OtherMachines
 
 pytestmark = pytest.mark.numerical
 

@@ -29,7 +29,7 @@ from retwin.catalog import CLASSIFIERS, classes
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.deploy.bundle.verdicts import Domain, Verdicts, check_channels
-from retwin.diagnosis.features import Features
+from retwin.diagnosis.trained.features import Features
 from retwin.nets.networks import CNN, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress

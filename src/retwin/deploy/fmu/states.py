@@ -15,7 +15,7 @@ from retwin.deploy.fmu.description import Variable, variables_of
 from retwin.deploy.fmu.text import Text, constants
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.dynamics.domain import Domain
+from retwin.update.dynamics.discrepancy.domain import Domain
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of
 

@@ -30,7 +30,7 @@ from retwin.deploy.onnx.graphs import (
 from retwin.deploy.onnx.operators import translations
 from retwin.deploy.onnx.portable import padded_times
 from retwin.diagnosis import NetworkDiagnoser
-from retwin.diagnosis.features import SETTLED
+from retwin.diagnosis.trained.features import SETTLED
 from retwin.nets.networks import MLP, TCN
 from retwin.progress import Progress, tracked
 from retwin.serialisation.models import write_model

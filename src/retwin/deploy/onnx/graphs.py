@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from retwin.data.segments import Segments
 from retwin.diagnosis import NetworkDiagnoser
-from retwin.diagnosis.features import Features
+from retwin.diagnosis.trained.features import Features
 from retwin.nets.student import shared_factor
 from retwin.update.corrections import Context, Correction, SampledSensor, sensor_of
 from retwin.update.corrections.tensor_segments import TensorSegments

@@ -33,7 +33,7 @@ from retwin.update.agreement import check_with_twin
 from retwin.update.blackbox import BLACK_BOXES, fit_black_box
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive, DelayOffset
-from retwin.update.corrections.machines import OtherMachines
+from retwin.update.corrections.commands.machines import OtherMachines
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
 from retwin.update.forecast_errors import ForecastErrors, predictive_deviation

@@ -19,8 +19,8 @@ from retwin.inference.hierarchy import Likelihood
 from retwin.inference.solver import solve
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import CommandSpace, Context, Discrepancy, before_sensor, sample_mask
-from retwin.update.corrections.command_inference import Hyperparameters
-from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.commands.inference import Hyperparameters
+from retwin.update.corrections.commands.problem import CommandProblem
 from retwin.update.corrections.delay_range import range_in_samples
 
 

@@ -19,7 +19,7 @@ from scipy.stats import t as student
 
 from retwin.serialisation.models import check_weights
 from retwin.twins.faults.actuator_faults import ActuatorBias, Fault
-from retwin.update.dynamics.noise import CERTAIN
+from retwin.update.dynamics.filter.noise import CERTAIN
 
 SIZES = (1 / 6, 1 / 2, 5 / 6)
 """Sizes of a bias that are tried, as shares of the way from its smallest to its largest size on a

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from retwin.checks import finite
 from retwin.monitor.detect.detector import Detector
 from retwin.monitor.detect.slack import Slack
-from retwin.update.dynamics.online import FilterState, OnlineFilter
-from retwin.update.dynamics.prediction import root_of, whitened
+from retwin.update.dynamics.filter.online import FilterState, OnlineFilter
+from retwin.update.dynamics.filter.prediction import root_of, whitened
 from retwin.update.dynamics.twin import DynamicsTwin
 
 SLOWER = 1e-4

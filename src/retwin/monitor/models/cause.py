@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from retwin.checks import require, whole
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.estimate import Estimate
-from retwin.diagnosis.fault_evidence import FaultEvidence
-from retwin.diagnosis.state_inversion import StateInversionDiagnoser
+from retwin.diagnosis.inversion.fault_evidence import FaultEvidence
+from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.monitor.models.watched import Alarm
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.faults.system_faults import (
@@ -27,7 +27,7 @@ from retwin.twins.faults.system_faults import (
     SizedFault,
     TimedFault,
 )
-from retwin.update.dynamics.online import moved
+from retwin.update.dynamics.filter.online import moved
 from retwin.update.dynamics.twin import DynamicsTwin
 
 PROBABLE = 0.5

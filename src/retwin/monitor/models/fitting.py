@@ -34,7 +34,7 @@ from retwin.monitor.models.monitor import Monitor
 from retwin.twins.twin import check_channels
 from retwin.update.blackbox import fit_black_box
 from retwin.update.blackbox.levels import fit_levels
-from retwin.update.dynamics.prediction import log_density
+from retwin.update.dynamics.filter.prediction import log_density
 from retwin.update.dynamics.twin import DynamicsTwin
 
 SEPARATION = 200

@@ -36,7 +36,7 @@ from retwin.monitor.models.saved import read_fields, write_fields
 from retwin.monitor.models.visible import Visible
 from retwin.monitor.models.watched import Alarm, Ending, Watched
 from retwin.twins.twin import check_channels
-from retwin.update.dynamics.online import OnlineFilter
+from retwin.update.dynamics.filter.online import OnlineFilter
 from retwin.update.dynamics.twin import BEYOND, DynamicsTwin
 
 SIZE = 256

@@ -14,7 +14,7 @@ from retwin.monitor.detect.detector import DetectorState
 from retwin.monitor.detect.disturbance import DisturbanceState
 from retwin.monitor.detect.events import Course
 from retwin.monitor.detect.validity import ValidityState
-from retwin.update.dynamics.online import FilterState
+from retwin.update.dynamics.filter.online import FilterState
 
 Kind = TypeVar("Kind")
 PARTS = ("disturbance", "detector", "validity")

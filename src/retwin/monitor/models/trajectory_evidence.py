@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.estimate import ImplausibleError
-from retwin.diagnosis.inversion import InversionDiagnoser
-from retwin.diagnosis.state_inversion import StateInversionDiagnoser
+from retwin.diagnosis.inversion.states import StateInversionDiagnoser
+from retwin.diagnosis.inversion.trajectories import InversionDiagnoser
 from retwin.errors import InputError
 from retwin.progress import Progress, tracked
 from retwin.twins.twin import check_channels

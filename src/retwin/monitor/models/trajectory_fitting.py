@@ -22,7 +22,7 @@ from retwin.monitor.models.trajectory_evidence import (
 )
 from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault
-from retwin.update.dynamics.noise import CERTAIN
+from retwin.update.dynamics.filter.noise import CERTAIN
 
 MIN_TRAJECTORIES = 8
 """Healthy trajectories of a calibration, at least."""

@@ -26,7 +26,7 @@ from retwin.monitor.server.journal import Journal
 from retwin.monitor.store.gridded import gridded
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.versions.registry import Registry
-from retwin.update.dynamics.noise import CERTAIN
+from retwin.update.dynamics.filter.noise import CERTAIN
 
 SILENT = 20
 """Sample periods without a new sample after which an asset counts as stopped, 30 s at least."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import agree, given, require
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.inversion import InversionDiagnoser
+from retwin.diagnosis.inversion.trajectories import InversionDiagnoser
 from retwin.evaluation.fidelity.simulation import simulate_records
 from retwin.monitor.detect.promise import FalseAlarmTest
 from retwin.monitor.models.cause import BEFORE

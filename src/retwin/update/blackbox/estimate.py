@@ -21,9 +21,9 @@ from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.estimation import Estimation, Point, correlation_time
+from retwin.update.dynamics.filter.noise import widening
 from retwin.update.dynamics.fitting import assembled
 from retwin.update.dynamics.left_out import held_out
-from retwin.update.dynamics.noise import widening
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 

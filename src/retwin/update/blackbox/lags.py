@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.update.dynamics.corrected import Domain
-from retwin.update.dynamics.library import Library
-from retwin.update.dynamics.terms import Term
+from retwin.update.dynamics.discrepancy.equations import Domain
+from retwin.update.dynamics.discrepancy.library import Library
+from retwin.update.dynamics.discrepancy.terms import Term
 
 ROWS_PER_TERM = 10
 """Least number of samples per term."""

@@ -16,9 +16,9 @@ from retwin.data.trajectories import Trajectories
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import Parameter
-from retwin.update.dynamics.domain import Domain
+from retwin.update.dynamics.discrepancy.domain import Domain
+from retwin.update.dynamics.discrepancy.terms import WIDEST
 from retwin.update.dynamics.estimation import correlation_time
-from retwin.update.dynamics.terms import WIDEST
 from retwin.update.dynamics.twin import DynamicsTwin
 
 

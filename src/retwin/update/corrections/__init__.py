@@ -12,7 +12,7 @@ from retwin.update.corrections.chain import (
     sample_mask,
     sensor_of,
 )
-from retwin.update.corrections.command_space import CommandSpace
+from retwin.update.corrections.commands.command_space import CommandSpace
 from retwin.update.corrections.correction import Context, Correction, Discrepancy, Head
 from retwin.update.corrections.delay_offset import DelayOffset
 from retwin.update.corrections.sampled_sensor import SampledSensor

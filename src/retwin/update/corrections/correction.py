@@ -12,7 +12,7 @@ from torch import Tensor
 
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
-from retwin.update.corrections.machines import Learned, OtherMachines
+from retwin.update.corrections.commands.machines import Learned, OtherMachines
 
 CONSTANT = 1e-6
 """Standard deviation of a constant output, relative to its size: the rounding of numbers."""

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from retwin.checks import require
+from retwin.update.corrections.commands.path_problem import PathProblem
 from retwin.update.corrections.correction import Context
 from retwin.update.corrections.delays import common_delay, first_delays
-from retwin.update.corrections.path_problem import PathProblem
 from retwin.update.corrections.warp import within
 
 FEW = 0.05

@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from retwin.inference.noise import Noise
-from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.commands.problem import CommandProblem
 
 HYPERPRIOR_SEGMENTS = 2.0
 """Segments that the hyperprior of an actuator's variance counts as much as."""

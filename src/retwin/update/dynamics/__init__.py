@@ -3,12 +3,12 @@
 Corrections of outputs and commands are in `retwin.update.corrections`.
 """
 
-from retwin.update.dynamics.curves import Curve
-from retwin.update.dynamics.domain import Domain
+from retwin.update.dynamics.discrepancy.curves import Curve
+from retwin.update.dynamics.discrepancy.domain import Domain
+from retwin.update.dynamics.discrepancy.library import Library
+from retwin.update.dynamics.discrepancy.network import TanhNetwork
+from retwin.update.dynamics.filter.prediction import Prediction
 from retwin.update.dynamics.fitting import FittedDynamics, fit_dynamics
-from retwin.update.dynamics.library import Library
-from retwin.update.dynamics.network import TanhNetwork
-from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of

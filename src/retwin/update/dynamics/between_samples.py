@@ -27,8 +27,8 @@ from retwin.update.dynamics.candidates import (
     without_discrepancy,
 )
 from retwin.update.dynamics.estimation import Estimation
+from retwin.update.dynamics.filter.noise import edges
 from retwin.update.dynamics.linearised import Linearised
-from retwin.update.dynamics.noise import edges
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.unknowns import Unknowns
 

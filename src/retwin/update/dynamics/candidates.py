@@ -13,11 +13,11 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.equations.interpolation import delays_tried
 from retwin.twins.equations.state_twin import StateTwin
-from retwin.update.dynamics.corrected import CorrectedEquations
+from retwin.update.dynamics.discrepancy.equations import CorrectedEquations
+from retwin.update.dynamics.discrepancy.memory import Memory, times_tried, with_memories
 from retwin.update.dynamics.estimation import Estimation, correlation_time
 from retwin.update.dynamics.left_out import errors_without, held_out
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
-from retwin.update.dynamics.memory import Memory, times_tried, with_memories
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.unknowns import Unknowns
 

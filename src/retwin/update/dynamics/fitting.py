@@ -22,15 +22,15 @@ from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.between_samples import chosen
-from retwin.update.dynamics.corrected import CorrectedEquations
-from retwin.update.dynamics.domain import Domain
+from retwin.update.dynamics.discrepancy.domain import Domain
+from retwin.update.dynamics.discrepancy.equations import CorrectedEquations
+from retwin.update.dynamics.discrepancy.library import Library
+from retwin.update.dynamics.discrepancy.memory import Memory
+from retwin.update.dynamics.discrepancy.network import TanhNetwork
 from retwin.update.dynamics.estimation import Estimation, root
+from retwin.update.dynamics.filter.noise import fit_noise, folds, widening
 from retwin.update.dynamics.left_out import dependent_errors
-from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
-from retwin.update.dynamics.memory import Memory
-from retwin.update.dynamics.network import TanhNetwork
-from retwin.update.dynamics.noise import fit_noise, folds, widening
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of

@@ -14,8 +14,8 @@ from retwin.checks import one_of, require
 from retwin.serialisation.models import read_model, refusing, save_model
 from retwin.twins.equations.saved_equations import equations_from, equations_of
 from retwin.twins.equations.state_twin import StateTwin
-from retwin.update.dynamics.corrected import correctable
-from retwin.update.dynamics.domain import Domain
+from retwin.update.dynamics.discrepancy.domain import Domain
+from retwin.update.dynamics.discrepancy.equations import correctable
 from retwin.update.forecast_errors import ForecastErrors
 
 __all__ = ["read_fields", "write_fields"]

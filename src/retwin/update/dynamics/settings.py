@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from retwin.checks import instance, one_of, require, whole
-from retwin.update.dynamics.library import Library
-from retwin.update.dynamics.network import TanhNetwork
+from retwin.update.dynamics.discrepancy.library import Library
+from retwin.update.dynamics.discrepancy.network import TanhNetwork
 
 __all__ = ["Dynamics"]
 

@@ -19,12 +19,12 @@ from retwin.twins.equations.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
 from retwin.twins.wrappers.wrapper import TwinWrapper, chunk_generator
-from retwin.update.dynamics.curves import Curve, axes_of, curve_of
-from retwin.update.dynamics.domain import Domain
+from retwin.update.dynamics.discrepancy.curves import Curve, axes_of, curve_of
+from retwin.update.dynamics.discrepancy.domain import Domain
 from retwin.update.dynamics.estimation import Estimation, root
-from retwin.update.dynamics.filtering import DynamicsFilter
+from retwin.update.dynamics.filter.filtering import DynamicsFilter
+from retwin.update.dynamics.filter.prediction import Prediction
 from retwin.update.dynamics.linearised import Point
-from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.saved import KIND, read_fields, write_fields
 from retwin.update.dynamics.simulation import FreeSimulation
 from retwin.update.dynamics.unknowns import unknowns_of

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from retwin.checks import require
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
-from retwin.update.dynamics.terms import WIDEST
+from retwin.update.dynamics.discrepancy.terms import WIDEST
 
 __all__ = ["Unknowns", "coefficients_of", "state_names", "state_twin_of", "unknowns_of"]
 

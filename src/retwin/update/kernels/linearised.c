@@ -1,5 +1,5 @@
 /* Effective commands and the Jacobian of a memoryless network's outputs by delays and offsets of
-   segments; see `_linearised` in `retwin.update.corrections.command_problem`, which is the same in
+   segments; see `_linearised` in `retwin.update.corrections.commands.problem`, which is the same in
    torch and explains it. */
 
 typedef struct {

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from retwin.checks import agree, given, instance, require
 from retwin.twins.twin import Twin
 from retwin.update.corrections import CommandSpace, Correction, before_sensor
-from retwin.update.corrections.machines import OtherMachines
+from retwin.update.corrections.commands.machines import OtherMachines
 from retwin.update.residual.loading import load_residual
 from retwin.update.residual.residual import Residual
 

@@ -23,7 +23,7 @@ from retwin.nets.training import Fit
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, save_model
 from retwin.update.corrections import Context, Correction
-from retwin.update.corrections.machines import Learned
+from retwin.update.corrections.commands.machines import Learned
 from retwin.update.surrogate import Surrogate
 
 D = TypeVar("D")

@@ -1,0 +1,260 @@
+"""`FaultEvidence`: how well faults of a system with states explain one record.
+
+The likelihood is that of the extended Kalman filter, as a mean over the sizes and times of a fault
+and over the posterior of the twin's parameters, on which predictions depend linearly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from retwin.data.trajectories import Trajectories
+from retwin.diagnosis.inversion.adaptive_grid import Integral, integrate
+from retwin.twins.faults.actuator_faults import ends_of
+from retwin.twins.faults.system_faults import (
+    ActuatorGain,
+    ParameterFault,
+    SensorBias,
+    SensorDrift,
+    SensorFreeze,
+    SizedFault,
+    TimedFault,
+)
+from retwin.update.dynamics import DynamicsTwin
+from retwin.update.dynamics.filter.likelihood import NoiseVariances, Record, Variants
+from retwin.update.dynamics.filter.prediction import root_of, whitened
+
+LEVELS = (0.03, 0.1, 0.3, 1.0)
+"""Standard deviations of what is unknown: of process noise per sample, in usual steps of a state,
+or of measurement noise, in standard deviations of an output in the record."""
+FROZEN = np.array([1.0, 1e-2, 1e-4])
+"""Standard deviations of a sensor that is frozen, in those of its noise in calibration."""
+SMALLEST = 0.1
+"""Smallest effect of parameters that counts: a change of the log density by 0.005 nats."""
+ROWS = 256
+"""Simulations that are filtered together, which bounds memory."""
+
+
+NOTHING = np.full(3, np.nan)
+"""The size, onset and end of no fault."""
+
+_Noise = NoiseVariances
+_Hypothesis = tuple[TimedFault | None, NDArray]
+"""A fault with its size, onset and end, (3,), in samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class FaultEvidence:
+    """One trajectory, with the filter of a twin.
+
+    Attributes
+    ----------
+    record : Record
+        The commands and outputs of the trajectory, with the corrected dynamics.
+
+    """
+
+    record: Record
+
+    @classmethod
+    def of(cls, twin: DynamicsTwin, trajectory: Trajectories, known_start: bool) -> FaultEvidence:
+        """That of one trajectory, whose outputs are 0 where they were not measured."""
+        seen = trajectory.mask[0]
+        measured = np.where(seen, trajectory.observed[0].astype(np.float64), 0.0)
+        commands = trajectory.commands[0].astype(np.float64)
+        return cls(Record(twin, commands, measured, seen, known_start))
+
+    @property
+    def twin(self) -> DynamicsTwin:
+        """The corrected dynamics."""
+        return self.record.twin
+
+    def largest_error(self) -> float:
+        """The largest error of a prediction for the healthy system, in standard deviations."""
+        measured, seen = self.record.measured[None], self.record.seen[None]
+        mean, covariance, _ = self.record.filtered(Variants())
+        errors = whitened(measured - mean, root_of(covariance, seen), seen)
+        return float(np.abs(errors).max()) if np.isfinite(errors).all() else np.inf
+
+    def integral(self, fault: TimedFault | None, *, coverage: float = 0.9) -> Integral:
+        """The evidence for a fault, and the posterior of its size, onset and end.
+
+        Parameters
+        ----------
+        coverage : float, default 0.9
+            Coverage of all intervals.
+
+        """
+        steps, rate = len(self.record.commands), self.twin.rate
+        if fault is None:
+            return Integral(float(self._under(None, NOTHING[None])[0]), *[NOTHING] * 4)
+        sizes = ends_of(fault.size) if isinstance(fault, SizedFault) else (1.0, 1.0)
+        limits = np.array([sizes, fault.onset_range(steps, rate), fault.end_range(steps, rate)])
+
+        def log_likelihood(points: NDArray) -> NDArray:
+            _, onset, end = points.T
+            # As it is drawn: the onset, and then an end after it.
+            first = np.maximum(limits[2, 0], onset + 1)
+            choices = np.maximum(limits[2, 1], onset + 1) - first + 1
+            own = np.log((limits[2, 1] - limits[2, 0] + 1) / choices)
+            possible = (end >= first) | (limits[2, 0] == limits[2, 1])
+            return np.where(possible, own + self._under(fault, points), -np.inf)
+
+        found = integrate(log_likelihood, limits, np.array([False, True, True]), coverage)
+        missing = np.array(
+            [not isinstance(fault, SizedFault), False, fault.end is None], dtype=bool
+        )
+        scale = np.array([1.0, rate, rate])
+        ends = (np.where(missing, np.nan, e / scale) for e in (found.low, found.mean, found.high))
+        return Integral(found.evidence, found.best, *ends)
+
+    def tolerated(
+        self, fault: TimedFault | None, found: Integral, *, tolerance: float = 0.1
+    ) -> Integral:
+        """The same with the evidence for a fault whose effect differs somewhat from its equation.
+
+        The difference is noise, as probable beforehand as none.
+
+        Parameters
+        ----------
+        tolerance : float, default 0.1
+            Share of a fault's effect by which it may differ from that of its equation.
+
+        """
+        if fault is None or not np.isfinite(found.evidence):
+            return found
+        states, outputs = self._effect(fault, found.best)
+        noise = ((tolerance * states) ** 2, (tolerance * outputs) ** 2)
+        gain = self._gains([(fault, found.best)], noise)[0]
+        return replace(found, evidence=found.evidence + float(np.logaddexp(0, gain) - np.log(2)))
+
+    def unknown(self, faults: Iterable[TimedFault | None], found: Iterable[Integral]) -> float:
+        """The evidence for something else besides one of the faults, or besides none.
+
+        It adds noise to what the twin predicts with the most probable size and times of the fault.
+        """
+        pairs = [each for each in zip(faults, found, strict=True) if np.isfinite(each[1].evidence)]
+        points = [(fault, own.best) for fault, own in pairs]
+        evidence = np.array([own.evidence for _, own in pairs])
+        made = [evidence + self._gains(points, noise) for noise in self._noises()] if pairs else []
+        return float(logsumexp(made) - np.log(np.size(made))) if pairs else -np.inf
+
+    def _gains(self, points: Sequence[_Hypothesis], noise: _Noise) -> NDArray:
+        """By how much more noise, with the slopes of its filter, raises log densities (J,)."""
+        slopes, own = self._slopes(noise), [self._inputs(fault, p[None])[0] for fault, p in points]
+        more = np.array([self.record.log_density(each, slopes, noise)[0] for each in own])
+        less = [self.record.log_density(each, self._by_parameters)[0] for each in own]
+        return np.where(np.isfinite(more), more - less, -np.inf)
+
+    def _effect(self, fault: TimedFault, point: NDArray) -> tuple[NDArray, NDArray]:
+        """Root mean square effects of a fault on states, per sample, and on measured outputs."""
+        twin, record = self.twin, self.record
+        variants, _ = self._inputs(fault, point[None])
+        commands, measured, _, changes = record.inputs(variants)
+        x = record.filtered(variants)[2][0]
+        own = None if changes is None else changes[0]
+        slopes = twin.slope(x, commands[0], own) - twin.slope(x, record.commands)
+        steps = slopes if twin.equations.step else slopes / twin.rate
+        active = _active(point[None], len(record.commands))[0]
+        both = (steps[active], (measured[0] - record.measured)[active])
+        return tuple(np.sqrt(np.mean(each**2, axis=0)) for each in both)
+
+    def _noises(self) -> list[_Noise]:
+        """Variances that are added to those of process or measurement noise."""
+        twin = self.twin
+        step = twin.domain.speed if twin.equations.step else twin.domain.speed / twin.rate
+        columns = zip(self.record.measured.T, self.record.seen.T, strict=True)
+        usual = np.array([own[seen].std() if seen.any() else 0.0 for own, seen in columns])
+        more: list[_Noise] = [((level * step) ** 2, 0.0) for level in LEVELS]
+        return more + [(0.0, (level * usual) ** 2) for level in LEVELS]
+
+    def _under(self, fault: TimedFault | None, points: NDArray) -> NDArray:
+        """Log likelihoods (J,) under a fault of these sizes, onsets and ends (J, 3), in samples."""
+        made = []
+        for rows in range(0, len(points), ROWS):
+            variants, gain = self._inputs(fault, points[rows : rows + ROWS])
+            made.append(gain + self.record.log_density(variants, self._by_parameters))
+        return np.concatenate(made)
+
+    def _inputs(self, fault: TimedFault | None, points: NDArray) -> tuple[Variants, NDArray]:
+        """What a fault changes of the record at points (J, 3), and log densities (J,) besides."""
+        record, none = self.record, np.zeros(len(points))
+        (size, onset, _), active = points.T, _active(points, len(record.commands))
+        match fault:
+            case ParameterFault(parameter=name):
+                change = fault.profiles(active, size, onset, self.twin.rate)
+                return Variants(
+                    change=change, parameter=self.twin.equations.names.index(name)
+                ), none
+            case ActuatorGain(actuator=place):
+                commands = np.tile(record.commands, (len(points), 1, 1))
+                commands[..., place] *= 1 + fault.profiles(active, size, onset, self.twin.rate)
+                return Variants(commands=commands), none
+            case SensorBias(output=place) | SensorDrift(output=place):
+                measured = np.tile(record.measured, (len(points), 1, 1))
+                measured[..., place] -= fault.profiles(active, size, onset, self.twin.rate)
+                return Variants(measured=measured), none
+            case SensorFreeze(output=place):
+                seen = np.tile(record.seen, (len(points), 1, 1))
+                pairs = zip(active, seen, strict=True)
+                gain = [self._density_frozen(place, own, each) for own, each in pairs]
+                return Variants(seen=seen), np.array(gain)
+        return Variants(), none
+
+    def _density_frozen(self, output: int, active: NDArray, seen: NDArray) -> float:
+        """Log density of a frozen sensor's samples, which are removed from those `seen` (T, d_y).
+
+        It repeats the sample of the onset, with a noise that cannot be smaller than what the steps
+        of its digits make.
+        """
+        places = np.flatnonzero(active & seen[:, output])
+        if len(places) < 2:
+            return 0.0
+        measured, known = self.record.measured[:, output], self.record.seen[:, output]
+        error = measured[places[1:]] - measured[places[0]]
+        seen[places[1:], output] = False
+        least = _digit(measured[known]) / np.sqrt(12)
+        deviation = np.maximum(FROZEN * np.sqrt(self.twin.noise[output]), least)
+        each = -0.5 * np.sum((error / deviation[:, None]) ** 2, axis=1)
+        each -= len(error) * np.log(deviation * np.sqrt(2 * np.pi))
+        return float(logsumexp(each) - np.log(len(FROZEN)))
+
+    @cached_property
+    def _by_parameters(self) -> NDArray:
+        """Those of the twin with its own noise."""
+        return self._slopes((0.0, 0.0))
+
+    def _slopes(self, more: _Noise) -> NDArray:
+        """Derivatives (T, d_y, r) of predictions by the parameters, along r directions."""
+        record = self.record
+        given = (each[None] for each in (record.commands, record.measured, record.seen))
+        made = self.twin.filter.slopes(*given, more=more, known_start=record.known_start)[0]
+        made = np.where(record.seen[..., None], made, 0.0)
+        covariance = record.filtered(Variants(), more)[1]
+        factor = root_of(covariance, record.seen[None])[0]
+        scaled = np.linalg.solve(factor, made).reshape(-1, made.shape[2])
+        if not np.isfinite(scaled).all():
+            return made[..., :0]
+        _, values, directions = np.linalg.svd(scaled, full_matrices=False)
+        return made @ directions[values > SMALLEST].T
+
+
+def _digit(values: NDArray) -> float:
+    """The smallest step between values, beyond rounding."""
+    steps = np.diff(np.unique(values))
+    steps = steps[steps > 1e-9 * np.abs(values).max()]
+    return float(steps.min()) if len(steps) else 0.0
+
+
+def _active(points: NDArray, steps: int) -> NDArray:
+    """Whether faults with the onsets and ends of points (J, 3), in samples, act: (J, T) bool."""
+    onset, end = points[:, 1:2], points[:, 2:]
+    index = np.arange(steps)
+    made: NDArray = (index >= onset) & (index < np.maximum(end, onset + 1))
+    return made

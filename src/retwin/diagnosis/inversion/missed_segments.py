@@ -1,0 +1,111 @@
+"""The best fit of a hypothesis, with segments missed where they are explained worst.
+
+Rows are hypotheses about trajectories, all solved together. The constants here are numerical: they
+trade time for accuracy.
+"""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from retwin.inference.em import expectation_maximisation
+from retwin.inference.losses import StudentT
+from retwin.inference.noise import Noise, predicted_variance
+from retwin.update.corrections.commands.missed_segments import (
+    MARGIN,
+    SEARCHES,
+    CommandFit,
+    LatentPrior,
+    MissedSearch,
+    searched,
+)
+from retwin.update.corrections.commands.problem import CommandProblem
+
+WORST = 2
+"""Segments of a row that one search may try as missed: the worst explained ones."""
+
+
+def best_fit(
+    problem: CommandProblem, prior: LatentPrior, noise: Noise, start: Tensor, trajectory: Tensor
+) -> MissedSearch:
+    """The most probable missed segments, from x (R, P) and none missed on.
+
+    `trajectory` (R,) is the trajectory of each row. Each time the segments that are explained worst
+    are tried as missed by every actuator that was to move. Rows that cannot come near the best of
+    their trajectory are left alone.
+    """
+
+    def suspects(fit: CommandFit, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _suspects(problem, fit, prior, noise, trajectory, rows)
+
+    return searched(problem, prior, noise, CommandFit.of_prior(problem, prior, start), suspects)
+
+
+def fitted_noise(problem: CommandProblem, prior: LatentPrior, *, rounds: int) -> Noise:
+    """The noise of healthy trajectories, by so many rounds of expectation-maximisation."""
+    start = prior.gaussian.mean
+    trajectory = torch.arange(len(start))
+
+    def infer(fit: CommandFit, noise: Noise) -> CommandFit:
+        return best_fit(problem, prior, noise, fit.x, trajectory).fit
+
+    def learn(fit: CommandFit, noise: Noise) -> Noise:
+        residual, jacobian = problem.with_missed(fit.missed).linearised(fit.x)
+        variance = predicted_variance(jacobian, fit.solution.covariance)
+        return problem.learned_noise(noise, residual, variance)
+
+    _, noise = expectation_maximisation(
+        CommandFit.of_prior(problem, prior, start),
+        Noise.from_median(problem, problem.residual(start), groups=2),
+        infer=infer,
+        learn=learn,
+        rounds=rounds,
+    )
+    return noise
+
+
+def _suspects(
+    problem: CommandProblem,
+    fit: CommandFit,
+    prior: LatentPrior,
+    noise: Noise,
+    trajectory: Tensor,
+    rows: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Row, segment and actuator of all that is worth trying as missed."""
+    part, own = problem[rows].with_missed(fit.missed[rows]), prior[rows]
+    gain = (_surplus(part, fit.x[rows], own, noise) + own.odds.amax(dim=-1)).clamp_min(0)
+    # What an actuator does in the segment in which it is held lasts through all that follow.
+    lasting = part.healthy.clone()
+    lasting[:, :-1] &= part.valid[:, 1:, None] & ~part.healthy[:, 1:]
+    lasting[:, -1:] = False
+    # A try cannot gain more than the surplus misfit, in as many segments as can be missed.
+    bound = gain.topk(min(SEARCHES, gain.shape[1]), dim=1).values.sum(dim=1)
+    bound = torch.where(lasting.any(dim=(1, 2)), gain.sum(dim=1), bound)
+    best = torch.full((len(fit.x),), -torch.inf, dtype=torch.float64)
+    best = best.scatter_reduce(0, trajectory, fit.evidence, "amax")
+    hopeful = (bound > 0) & (fit.evidence[rows] + bound > best[trajectory[rows]] - MARGIN)
+    worst = (gain > 0) & (gain >= gain.topk(min(WORST, gain.shape[1]), dim=1).values[:, -1:])
+    # Where next to nothing was to move nothing can be missed.
+    moving = part.distance > 2 * part.per_segment(own.deviation)[..., 1:]
+    chosen = hopeful[:, None, None] & (worst[..., None] | lasting) & moving & part.healthy
+    row, segment, actuator = (chosen & (part.missed < 0.5)).nonzero().unbind(dim=1)
+    return rows[row], segment, actuator
+
+
+def _surplus(problem: CommandProblem, x: Tensor, prior: LatentPrior, noise: Noise) -> Tensor:
+    """How much more each segment (R, M) costs than expected of the truth, in nats.
+
+    It bounds what can be gained. A misfit below its expectation does not make up for an improbable
+    x.
+    """
+    residual = problem.residual(x)
+    expected = cast(StudentT, noise.loss).expected(residual.shape[-1]) * noise.count(problem)
+    misfit = noise.misfit(problem, residual) - expected
+    # Errors of segments are correlated: each segment's share of what the prior costs.
+    cost = 0.5 * (x - prior.gaussian.mean) * prior.gaussian.gradient(x) + prior.excess(x)
+    cost = problem.per_segment(cost).sum(dim=-1)
+    return (problem.inside * misfit[:, None]).sum(dim=-1).clamp_min(0) + cost

@@ -1,0 +1,1 @@
+"""Diagnosers that are trained on labelled trajectories: networks, features and a linear model."""

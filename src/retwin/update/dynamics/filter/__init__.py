@@ -1,0 +1,1 @@
+"""The Kalman filter of corrected state equations, and the noise that it assumes."""
