@@ -48,7 +48,10 @@ def test_an_alarm_until_t_has_a_probability_of_at_most_t_over_the_arl() -> None:
         assert np.mean(found <= until) <= until / 400 + 2 / np.sqrt(2000) * np.sqrt(until / 400)
 
 
-@pytest.mark.parametrize("change", ["up", "down", "wide", "narrow", "stuck", "tails", "dependent"])
+CHANGES = ["up", "down", "wide", "narrow", "stuck", "frozen", "tails", "dependent"]
+
+
+@pytest.mark.parametrize("change", CHANGES)
 def test_each_change_is_found(change: str) -> None:
     rng = np.random.default_rng(3)
     noise = rng.normal(size=(50, 400))
@@ -62,11 +65,41 @@ def test_each_change_is_found(change: str) -> None:
         "wide": 3 * noise,
         "narrow": noise / 3,
         "stuck": np.zeros_like(noise),
+        "frozen": np.linspace(-2.0, 2.0, 50)[:, None] + noise / 50,
         "tails": np.where(rng.random(noise.shape) < 0.15, 5, 0.8) * noise,
         "dependent": dependent,
     }[change]
     found = run_lengths(Detector(Slack(1.25, 0.1)), 1e6, changed)
     assert np.median(found) < (400 if change == "tails" else 150 if change == "dependent" else 60)
+
+
+@pytest.mark.parametrize("alternative", [Location(1.0), Scale(2.5)])
+def test_a_change_that_lasts_is_rarely_over_and_one_that_ended_is_soon(
+    alternative: Location | Scale,
+) -> None:
+    rng = np.random.default_rng(5)
+    noise = rng.normal(size=(400, 300))
+    detector = Detector(Slack(1.1, 0.1), alternatives=((alternative,),))
+    lasts = noise + 1.0 if isinstance(alternative, Location) else 2.5 * noise
+    change = np.stack([np.arange(400), np.zeros(400, dtype=int)], axis=1)
+    given = np.ones(400), change, np.zeros(400)
+    reached = (detector.over(*given, lasts) >= 2000).any(axis=1)
+    assert reached.mean() <= 300 / 2000
+    assert np.median((detector.over(*given, noise) >= 2000).argmax(axis=1)) < 40
+
+
+def test_evidence_that_a_change_is_over_does_not_depend_on_how_samples_are_grouped() -> None:
+    scores = np.random.default_rng(6).normal(size=(2, 50))
+    scores[0, 20:30] = np.nan
+    detector, change = Detector(), np.array([[0, 3], [1, 9]])
+    whole = detector.over(np.ones(2), change, np.zeros(2), scores)
+    state, evidence, parts = detector.start(2), np.ones(2), []
+    for part in np.split(scores, [7, 24, 25], axis=1):
+        parts.append(detector.over(evidence, change, state.previous, part))
+        evidence = parts[-1][:, -1]
+        state, _ = detector.run(state, part)
+    assert np.concatenate(parts, axis=1).tobytes() == whole.tobytes()
+    assert (np.diff(whole[0, 20:30]) == 0).all(), "missing samples are no evidence"
 
 
 @pytest.mark.parametrize("kind", ["shiryaev_roberts", "cusum"])

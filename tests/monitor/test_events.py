@@ -18,10 +18,12 @@ from retwin.monitor.detect.validity import Validity
 from retwin.monitor.versions.decision import Decision
 
 RULES = Rules(arl=1000.0, wanted=5, lasting=20)
+OVER = np.full((1, 1), np.inf)
+AFTER = np.zeros((1, 2), dtype=int), np.ones(1)
 
 
 def course(event: int = -1, quiet: int = 0, samples: int = 100) -> Course:
-    return Course(*(np.array([each]) for each in (samples, 0, event, quiet)))
+    return Course(*(np.array([each]) for each in (samples, 0, event, quiet)), *AFTER)
 
 
 def test_an_alarm_is_raised_at_the_run_length_and_not_below() -> None:
@@ -33,31 +35,49 @@ def test_an_event_needs_as_many_samples_as_show_a_shift_of_one_deviation() -> No
     assert rules.wanted == 28  # 2 log(1e6) = 27.6
     for steps in (4, 5, 6):
         counted = np.ones((1, steps), dtype=bool)
-        ends = RULES.ends(course(event=90), np.zeros((1, steps)), counted)[0]
+        ends = RULES.ends(course(event=90), np.zeros((1, steps)), OVER, counted)[0]
         assert ends.tolist() == [place >= 4 for place in range(steps)]
     counted = np.array([[True, False, True]])
-    assert RULES.ends(course(event=90, quiet=3), np.zeros((1, 3)), counted)[0].tolist() == [
+    assert RULES.ends(course(event=90, quiet=3), np.zeros((1, 3)), OVER, counted)[0].tolist() == [
         False,
         False,
         True,
     ]
-    assert not RULES.ends(course(), np.zeros((1, 9)), np.ones((1, 9), dtype=bool)).any()
-    unseen = RULES.ends(course(event=90, quiet=9), np.zeros((1, 1)), np.zeros((1, 1), dtype=bool))
+    assert not RULES.ends(course(), np.zeros((1, 9)), OVER, np.ones((1, 9), dtype=bool)).any()
+    unseen = RULES.ends(
+        course(event=90, quiet=9), np.zeros((1, 1)), OVER, np.zeros((1, 1), dtype=bool)
+    )
     assert not unseen.any()  # an event ends with a sample that is measured
 
 
 def test_an_event_of_the_first_sample_is_one() -> None:
     yes, no, counted = np.array([True]), np.array([False]), np.ones((1, 1), dtype=bool)
-    assert RULES.ends(course(event=0, quiet=9), np.zeros((1, 1)), counted).all()
+    assert RULES.ends(course(event=0, quiet=9), np.zeros((1, 1)), OVER, counted).all()
     assert RULES.changes(course(event=0), 1).all()
-    assert RULES.after(course(event=0), counted, yes, no, no).event[0] == 0
+    assert RULES.after(course(event=0), counted, yes, no, no, *AFTER).event[0] == 0
 
 
 def test_an_event_does_not_end_while_there_is_evidence() -> None:
     counted = np.ones((1, 1), dtype=bool)
     for evidence, ended in ((5 / CERTAIN - 1, True), (5 / CERTAIN, False)):
-        found = RULES.ends(course(event=90, quiet=4), np.array([[evidence]]), counted)
+        found = RULES.ends(course(event=90, quiet=4), np.array([[evidence]]), OVER, counted)
         assert found.tolist() == [[ended]]
+
+
+def test_an_event_does_not_end_while_its_change_may_last() -> None:
+    counted = np.ones((1, 1), dtype=bool)
+    for over, ended in ((5 / CERTAIN - 1, False), (5 / CERTAIN, True)):
+        given = np.zeros((1, 1)), np.array([[over]]), counted
+        assert RULES.ends(course(event=90, quiet=4), *given).tolist() == [[ended]]
+
+
+def test_evidence_that_a_change_is_over_begins_anew_with_each_alarm() -> None:
+    yes, no, counted = np.array([True]), np.array([False]), np.ones((1, 3), dtype=bool)
+    change, over = np.array([[1, 7]]), np.array([30.0])
+    alarmed = RULES.after(course(), counted, yes, no, no, change, over)
+    assert (alarmed.change.tolist(), alarmed.over.tolist()) == ([[1, 7]], [1.0])
+    later = RULES.after(alarmed, counted, no, no, no, np.zeros((1, 2), dtype=int), over)
+    assert (later.change.tolist(), later.over.tolist()) == ([[1, 7]], [30.0])
 
 
 def test_an_event_is_a_change_after_the_stated_time() -> None:
@@ -67,16 +87,16 @@ def test_an_event_is_a_change_after_the_stated_time() -> None:
 
 def test_an_alarm_opens_an_event_and_a_further_one_belongs_to_it() -> None:
     yes, no, counted = np.array([True]), np.array([False]), np.ones((1, 3), dtype=bool)
-    opened = RULES.after(course(quiet=7), counted, yes, no, no)
+    opened = RULES.after(course(quiet=7), counted, yes, no, no, *AFTER)
     assert (opened.event[0], opened.begun[0], opened.quiet[0]) == (102, 103, 0)
     assert opened.samples[0] == 103
-    further = RULES.after(opened, counted, yes, no, no)
+    further = RULES.after(opened, counted, yes, no, no, *AFTER)
     assert (further.event[0], further.begun[0], further.quiet[0]) == (102, 106, 0)
-    calm = RULES.after(opened, counted, no, no, no)
+    calm = RULES.after(opened, counted, no, no, no, *AFTER)
     assert (calm.event[0], calm.begun[0], calm.quiet[0]) == (102, 103, 3)
-    ended = RULES.after(calm, counted, no, yes, no)
+    ended = RULES.after(calm, counted, no, yes, no, *AFTER)
     assert (ended.event[0], ended.begun[0], ended.quiet[0]) == (-1, 103, 0)
-    changed = RULES.after(calm, counted, no, no, yes)
+    changed = RULES.after(calm, counted, no, no, yes, *AFTER)
     assert (changed.event[0], changed.begun[0], changed.quiet[0]) == (-1, 109, 0)
 
 

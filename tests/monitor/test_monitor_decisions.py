@@ -49,7 +49,9 @@ def monitor() -> Monitor:
 
 
 def course(event: int = -1, samples: int = 50, quiet: int = 0) -> Course:
-    return Course(*(np.array([each]) for each in (samples, 0, event, quiet)))
+    """One of which no evidence says that its change lasts."""
+    counts = (np.array([each]) for each in (samples, 0, event, quiet))
+    return Course(*counts, np.zeros((1, 2), dtype=int), np.array([1e250]))
 
 
 def part_of(monitor: Monitor, state: Any, steps: int = 1, **changes: bool) -> Part:

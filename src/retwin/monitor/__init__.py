@@ -11,7 +11,7 @@ from retwin._lazy import homes, names
 
 _HOME = homes(
     {
-        "detect.bets": "Dependence Location Scale Tails",
+        "detect.bets": "Dependence Location Repetition Scale Tails",
         "detect.detector": "Detector DetectorState",
         "detect.disturbance": "Disturbance DisturbanceState fit_disturbance",
         "detect.promise": "FalseAlarmTest Promise false_alarms",

@@ -18,15 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from retwin.monitor.detect.slack import Slack
+from retwin.monitor.detect.slack import CENTRE, Slack
 
 CLIP = 4.0
 """Scores beyond this count as this: evidence of one sample is bounded, and of heavy tails only the
 probability beyond the clip matters, which may be 6e-5 at κ = 1 and 0.0014 at κ = 1.25."""
 PER_UNIT = 64
 """Cells of the grid of scores per standard deviation."""
-LEVELS = 3
-"""The score before, on which bets on dependence depend, is rounded to -3, …, 3."""
+LEVELS = np.linspace(-CLIP, CLIP, 17)
+"""Values to which the score before is rounded, on which bets on dependence and repetition depend:
+halves, which are as narrow as a repetition."""
 FLOOR = 1e-6
 """Least value of a bet before its division: a product never becomes 0."""
 EDGES = np.concatenate(
@@ -117,12 +118,37 @@ class Dependence:
         return self.correlation * previous * score / kappa
 
 
+@dataclass(frozen=True)
+class Repetition:
+    """A `share` of the scores within about `width` of the one before, as of a frozen sensor.
+
+    Scores of a frozen sensor that are not near 0 are no smaller than others. After a score beyond
+    `CENTRE` nothing is bet: that such scores go on is a shift.
+    """
+
+    share: float
+    width: float
+
+    @property
+    def change(self) -> str:
+        """See `Alternative.change`."""
+        return "errors that repeat"
+
+    def log_bet(self, score: NDArray, previous: float, kappa: float) -> NDArray:
+        """Likelihood ratio of a mixture of a Gaussian distribution around the score before."""
+        if abs(previous) > CENTRE:
+            return np.zeros_like(score)
+        near = score**2 / 2 - ((score - previous) / self.width) ** 2 / 2
+        return np.log1p(self.share * (np.exp(near) / self.width - 1))
+
+
 ALTERNATIVES: tuple[tuple[Alternative, ...], ...] = (
     tuple(Location(sign * size) for size in (0.25, 0.5, 1.0, 2.0) for sign in (-1, 1)),
     (Scale(1.5), Scale(2.5), Scale(5.0)),
     (Scale(0.7), Scale(0.4), Scale(0.1)),
     (Tails(0.1, 4.0),),
     (Dependence(0.3), Dependence(0.6), Dependence(-0.3), Dependence(-0.6)),
+    (Repetition(0.9, 0.5),),
 )
 """Families of alternatives. Families have equal weights, and so have the members of a family: a
 larger number of sizes costs a delay of its logarithm."""
@@ -154,10 +180,7 @@ class Bets:
         """Bets on each alternative against each class; the newest ones are kept."""
         alternatives = [each for family in families for each in family]
         weights = [1 / len(families) / len(family) for family in families for _ in family]
-        levels = np.arange(-LEVELS, LEVELS + 1.0)
-        values = np.array(
-            [[_bets(each, slack, levels) for slack in slacks] for each in alternatives]
-        )
+        values = np.array([[_bets(each, slack) for slack in slacks] for each in alternatives])
         sums = np.zeros((*values.shape[:-1], len(EDGES)))
         np.cumsum(values * MASS, axis=-1, out=sums[..., 1:])
         mass = np.broadcast_to(ndtr(EDGES), sums.shape[1:])
@@ -177,13 +200,13 @@ class Bets:
 
     def offset(self, which: NDArray, previous: NDArray) -> NDArray:
         """Where the edges of a class and of a score before begin."""
-        level = np.rint(np.clip(previous, -LEVELS, LEVELS)).astype(np.intp) + LEVELS
-        return (which * (2 * LEVELS + 1) + level) * len(EDGES)
+        steps = (np.clip(previous, LEVELS[0], LEVELS[-1]) - LEVELS[0]) / (LEVELS[1] - LEVELS[0])
+        return (which * len(LEVELS) + np.rint(steps).astype(np.intp)) * len(EDGES)
 
 
-def _bets(alternative: Alternative, slack: Slack, levels: NDArray) -> NDArray:
+def _bets(alternative: Alternative, slack: Slack) -> NDArray:
     """An alternative's bet (levels, cells), divided by its largest expectation over the class."""
-    logs = [alternative.log_bet(CENTRES, level, slack.kappa) for level in levels]
+    logs = [alternative.log_bet(CENTRES, level, slack.kappa) for level in LEVELS]
     values = np.maximum(np.exp(np.minimum(logs, 40.0)), FLOOR)
     # Scores that a member of the class may have at the Gaussian quantiles of each cell.
     first = np.searchsorted(EDGES, slack.lower(EDGES[:-1]), side="right") - 1

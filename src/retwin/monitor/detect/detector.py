@@ -36,7 +36,7 @@ class DetectorState:
 
 @dataclass(frozen=True)
 class Detector:
-    """A mixture of e-detectors over location, scale, tails and dependence of scores.
+    """A mixture of e-detectors over location, scale, tails, dependence and repetition of scores.
 
     With the bets L_j of alternative j, whose expectation given the past is at most 1 for all
     distributions of the class `slack`,
@@ -168,6 +168,39 @@ class Detector:
             # A running sum: unlike that of np.sum, its order does not depend on the shape.
             made[t] = np.add.accumulate(evidence * weights, axis=0)[-1]
         return DetectorState(evidence.T, previous), made.T
+
+    def over(
+        self,
+        evidence: NDArray,
+        change: NDArray,
+        previous: NDArray,
+        score: ArrayLike,
+        high: ArrayLike | None = None,
+    ) -> NDArray:
+        """Evidence (n, T) that one change in each of n machines is over, by CUSUM.
+
+        It is M of the alternative's bets upside down: while the change lasts it reaches A after
+        more than about A samples, on average.
+
+        Parameters
+        ----------
+        evidence : array (n,)
+            After the samples before; 1 at first.
+        change : array (n, 2)
+            Of each machine, a stream and the number of an alternative.
+        previous : array (streams,)
+            The scores before, see `DetectorState`.
+        score, high : array (streams, T)
+            See `run`.
+
+        """
+        low, top = self.intervals(previous, score, high)
+        stream, number = change.T
+        made = np.empty((low.shape[1], len(evidence)))
+        for t, (factor, _, _) in enumerate(self.factors(previous, low, top)):
+            evidence = np.minimum(np.maximum(evidence, 1.0) / factor[number, stream], LARGEST)
+            made[t] = evidence
+        return made.T
 
     def intervals(
         self, previous: NDArray, score: ArrayLike, high: ArrayLike | None

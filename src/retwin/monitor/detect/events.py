@@ -3,8 +3,10 @@
 An alarm has no end, but a fault and what it leaves behind do. The first alarm opens an event, and
 those that follow belong to it. With each alarm filter and detector begin anew, since the states of
 the machine are not what was predicted. The event ends when the detector, since it began anew, has
-seen as many samples as show a shift by one standard deviation, and has no evidence against them.
-One that lasts longer than a stated time is a change: the machine of now is followed from there.
+seen as many samples as show a shift by one standard deviation, has no evidence against them, and
+has evidence that the change of the newest alarm is over. A small change, which is seen slowly, so
+needs more samples to end than a large one. An event that lasts longer than a stated time is a
+change: the machine of now is followed from there.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from numpy.typing import NDArray
 FOLLOWS, CHANGED = "the twin follows again", "changed"
 """How an event ends."""
 CERTAIN = 0.05
-"""Probability of more evidence than samples over this in a healthy machine."""
+"""Probability of more evidence than samples over this: for a change in a healthy machine, and for a
+healthy machine while the change lasts."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,10 @@ class Course:
         (n,), number of the first alarm's sample of the event that lasts; -1 for none.
     quiet : NDArray
         (n,), samples of which evidence was counted since the detector began anew.
+    change : NDArray
+        (n, 2), stream and number of the alternative of the newest alarm.
+    over : NDArray
+        (n,), evidence that this change is over, see `Detector.over`.
 
     """
 
@@ -41,12 +48,16 @@ class Course:
     begun: NDArray
     event: NDArray
     quiet: NDArray
+    change: NDArray
+    over: NDArray
 
     @classmethod
     def start(cls, count: int) -> Course:
         """Before the first sample."""
         zeros = np.zeros(count, dtype=np.int64)
-        return cls(zeros, zeros, zeros - 1, zeros)
+        return cls(
+            zeros, zeros, zeros - 1, zeros, np.zeros((count, 2), dtype=np.int64), zeros + 1.0
+        )
 
 
 @dataclass(frozen=True)
@@ -77,10 +88,10 @@ class Rules:
         """Where an alarm is raised."""
         return np.asarray(evidence >= self.arl)
 
-    def ends(self, course: Course, evidence: NDArray, counted: NDArray) -> NDArray:
+    def ends(self, course: Course, evidence: NDArray, over: NDArray, counted: NDArray) -> NDArray:
         """Where (n, T) an event ends, for machines that began a part with `course`."""
         quiet = course.quiet[:, None] + np.cumsum(counted, axis=1)
-        calm = (quiet >= self.wanted) & (evidence * CERTAIN < quiet)
+        calm = (quiet >= self.wanted) & (evidence * CERTAIN < quiet) & (over * CERTAIN >= quiet)
         return np.asarray((course.event >= 0)[:, None] & calm & counted)
 
     def changes(self, course: Course, steps: int) -> NDArray:
@@ -89,11 +100,19 @@ class Rules:
         return np.asarray((course.event >= 0)[:, None] & (age >= self.lasting))
 
     def after(
-        self, course: Course, counted: NDArray, alarm: NDArray, ended: NDArray, changed: NDArray
+        self,
+        course: Course,
+        counted: NDArray,
+        alarm: NDArray,
+        ended: NDArray,
+        changed: NDArray,
+        change: NDArray,
+        over: NDArray,
     ) -> Course:
         """The course after a part of T samples.
 
-        `counted` is (n, T); an alarm, an end and a change (n,) are those of its last sample.
+        `counted` is (n, T); an alarm, an end and a change of the machine (n,) are those of its last
+        sample, and so is what an alarm is for, `change` (n, 2), and the evidence `over` (n,).
         """
         last = course.samples + counted.shape[1] - 1
         opened = np.where(alarm & (course.event < 0), last, course.event)
@@ -103,4 +122,6 @@ class Rules:
             np.where(alarm | changed, last + 1, course.begun),
             np.where(ended | changed, -1, opened),
             np.where(anew, 0, course.quiet + counted.sum(axis=1)),
+            np.where(alarm[:, None], change, course.change),
+            np.where(anew, 1.0, over),
         )

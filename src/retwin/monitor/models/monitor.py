@@ -247,7 +247,12 @@ class Monitor:
         counted = np.isfinite(low).reshape(count, len(self.slack), -1).any(axis=1)
         rules = self.rules
         alarm = rules.alarms(total)
-        ended = rules.ends(state.course, total, counted) & ~alarm
+        over = np.repeat(state.course.over[:, None], samples, axis=1)
+        if not learn.all():
+            change = state.course.change + [[len(self.slack), 0]] * np.arange(count)[:, None]
+            given = state.course.over, change, state.detector.previous
+            over = streams.detector.over(*given, low, high)
+        ended = rules.ends(state.course, total, over, counted) & ~alarm
         outside = self._outside(commands)
         changed = rules.changes(state.course, samples) & ~ended
         filters = tuple(
@@ -268,7 +273,7 @@ class Monitor:
         )
         deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
         flags = alarm, ended, changed, counted, outside
-        return Part(after, mean, deviation, low, high, evidence, total, *flags)
+        return Part(after, mean, deviation, low, high, evidence, total, over, *flags)
 
     def _after(
         self,
@@ -293,11 +298,14 @@ class Monitor:
         void = np.logical_or.accumulate(broken, axis=1) | after.void[:, None]
         lasts = np.repeat((course.event >= 0)[:, None], void.shape[1], axis=1)
         lasts[opens, -1] = True
-        course = self.rules.after(course, part.counted, alarm, ended, changed)
+        rows = np.arange(len(alarm))
+        most = part.evidence[:, -1].reshape(-1, each).argmax(axis=1)
+        weighed = after.detector.evidence.reshape(len(alarm), each, -1)[rows, most]
+        change = np.stack([most, (weighed * streams.detector.bets.weights).argmax(axis=1)], axis=1)
+        ends = part.counted, alarm, ended, changed, change, part.over[:, -1]
+        course = self.rules.after(course, *ends)
         for machine in np.flatnonzero(alarm):
-            rows = slice(machine * each, (machine + 1) * each)
-            stream = int(np.argmax(part.evidence[rows, -1]))
-            weighed = after.detector.evidence[rows][stream] * streams.detector.bets.weights
+            stream, number = change[machine].tolist()
             sample = int(course.samples[machine]) - 1
             outputs = self.twin.outputs.names
             alarms.append(
@@ -306,7 +314,7 @@ class Monitor:
                     sample,
                     sample / self.twin.rate,
                     outputs[stream % len(outputs)],
-                    streams.detector.change(int(np.argmax(weighed))),
+                    streams.detector.change(number),
                     float(part.total[machine, -1]),
                     sample if opens[machine] else int(state.course.event[machine]),
                     not (void[machine, -1] or part.outside[machine, -1]),

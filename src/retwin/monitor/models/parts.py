@@ -25,6 +25,7 @@ class Part:
     high: NDArray
     evidence: NDArray
     total: NDArray
+    over: NDArray
     alarm: NDArray
     ended: NDArray
     changed: NDArray
