@@ -456,3 +456,30 @@ def test_a_sample_that_predicts_better_is_named_as_what_it_is(
         for who, rmse in (("model", 2.0), ("hold", 1.0))
     ]
     assert _verdict(scores) == [f"y: the {sample} sample is a better prediction."]
+
+
+@pytest.mark.parametrize(
+    ("coverage", "interval", "text"),
+    [
+        (0.9, None, ""),
+        (0.84, None, "fewer than five records cannot tell"),
+        (0.84, (0.7, 0.86), "these records cannot tell"),
+        (0.7, (0.6, 0.84), "do not rely on it here"),
+    ],
+)
+def test_a_band_that_holds_too_little_is_said_with_how_sure_that_is(
+    coverage: float, interval: tuple[float, float] | None, text: str
+) -> None:
+    model = ModelScore("model", "y", None, 1.0, 1.0, coverage, 1.0, interval)
+    found = _verdict([model, ModelScore("mean", "y", None, 2.0, 2.0, *2 * [float("nan")])])
+    assert len(found) == bool(text)
+    assert text in " ".join(found)
+
+
+def test_the_coverage_of_five_records_has_an_interval_that_contains_it() -> None:
+    found = rt.fit(twin_of(), records(1, 2, 3, slope=right), rt.Choice(candidates=("none",)))
+    for runs in ((5, 6, 7, 8), (5, 6, 7, 8, 9)):
+        (row, *_) = rt.score_model(found.twin, records(*runs, slope=right))
+        assert (row.interval is None) == (len(runs) < 5)
+    assert row.interval is not None
+    assert 0 <= row.interval[0] <= row.coverage <= row.interval[1] <= 1

@@ -200,9 +200,16 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
             if each.rmse < (1 - CLEAR) * own.rmse:
                 made.append(f"{each.output}: {words[each.who]} is a better prediction.")
         elif each.coverage < COVERAGE[0]:
+            text = f"{each.output}: the 90 % band holds {each.coverage:.0%} of these samples"
+            if each.interval is None or each.interval[1] >= COVERAGE[0]:
+                known = "fewer than five" if each.interval is None else "these"
+                made.append(
+                    f"{text}; {known} records cannot tell whether that is by "
+                    "chance: score more of other days before you rely on it."
+                )
+                continue
             made.append(
-                f"{each.output}: the 90 % band holds {each.coverage:.0%} of these samples: do not "
-                "rely on it here. These records may be few, of another day, or begin in other "
-                "states than the twin: identify it without the begin of records, --transient."
+                f"{text}: do not rely on it here. These records may be of another day, or begin in "
+                "other states than the twin: identify it without the begin of records, --transient."
             )
     return made

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from retwin.checks import finite, positive, require
 from retwin.data.trajectories import Trajectories
 from retwin.scores.distributions import crps_normal
+from retwin.scores.intervals import grouped_share_interval
 from retwin.twins.twin import Twin, check_channels
 from retwin.update.forecast_errors import USUAL, ForecastErrors
 from retwin.update.forecasts import forecasts, free_moments
@@ -36,6 +37,8 @@ class ModelScore:
     coverage, width : float
         Share of samples inside the 90 % band, and its mean width in the unit of the output; NaN
         for a predictor without bands.
+    interval : (float, float) or None
+        95 % interval of the coverage, from what varies between records; None for fewer than five.
 
     """
 
@@ -46,6 +49,7 @@ class ModelScore:
     crps: float
     coverage: float
     width: float
+    interval: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,9 +215,13 @@ def score_model(
     for who, each in predictions.items():
         for channel, output in enumerate(records.outputs.names):
             own = seen[..., channel] & np.isfinite(each.mean[..., channel])
-            error = (measured - each.mean)[..., channel][own]
-            deviation = each.deviation[..., channel][own]
-            rows.append(ModelScore(who, output, horizon, *_scores(error, deviation)))
+            error = (measured - each.mean)[..., channel]
+            deviation = each.deviation[..., channel]
+            banded = own & (deviation > 0)
+            hits, counts = (np.abs(error) <= USUAL * deviation) & banded, banded.sum(axis=1)
+            interval = grouped_share_interval(hits.sum(axis=1)[counts > 0], counts[counts > 0])
+            scores = _scores(error[own], deviation[own])
+            rows.append(ModelScore(who, output, horizon, *scores, interval))
     return rows
 
 
