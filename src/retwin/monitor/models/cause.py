@@ -36,6 +36,9 @@ BEFORE = 100
 """Samples before an alarm from which its cause is inferred."""
 MIN_WINDOW = 10
 """A window begins after the newest earlier alarm that leaves it more samples than this."""
+OFFSET = 3.0
+"""Largest offset of a sensor, in ranges of its output in calibration: a level that leaves its range
+would else be taken for a frozen sensor."""
 EVENT = 500
 """Samples of an event that are looked at, at most, to tell whether a second fault began in it."""
 
@@ -119,7 +122,7 @@ def possible_causes(
 
     Without known faults these are a shift and a drift of each parameter of the twin within its
     bounds, another gain of each command, and an offset, a drift and a freeze of each sensor, by up
-    to the range that the output has in calibration.
+    to the range that the output has in calibration, or three of these for an offset.
 
     Parameters
     ----------
@@ -162,7 +165,9 @@ def _any_change(twin: DynamicsTwin) -> dict[str, TimedFault]:
     spread = twin.filter(commands, unseen, unseen.astype(bool), known_start=False)[1][0, 0]
     for i, range_ in enumerate(np.sqrt(12 * np.diagonal(spread)).tolist()):
         name, rate = twin.outputs.names[i], range_ * twin.rate / BEFORE
-        made[f"{name}: sensor offset"] = SensorBias(output=i, size=(-range_, range_))
+        made[f"{name}: sensor offset"] = SensorBias(
+            output=i, size=(-OFFSET * range_, OFFSET * range_)
+        )
         made[f"{name}: sensor drift"] = SensorDrift(output=i, size=(-rate, rate))
         made[f"{name}: sensor frozen"] = SensorFreeze(output=i)
     return made
