@@ -9,7 +9,10 @@ write its module and add one entry here.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
 
+from retwin.checks import one_of
 from retwin.entries import (
     CaseEntry,
     Entry,
@@ -20,61 +23,23 @@ from retwin.entries import (
     Need,
     PublicFile,
     SourceEntry,
-    classes,
-    lookup,
-    make,
-    resolve,
 )
+from retwin.modules import import_beside
 
-__all__ = [
-    "CALIBRATE_ON",
-    "CANDIDATES",
-    "CASES",
-    "CLASSIFIERS",
-    "CORRECTIONS",
-    "DENSITIES",
-    "DIAGNOSERS",
-    "DOWNLOADS",
-    "EXTRAS",
-    "FORMATS",
-    "IDENTIFICATIONS",
-    "LOGS",
-    "METRICS",
-    "NEEDS",
-    "NETWORKS",
-    "OPENED_CASE",
-    "PRESETS",
-    "SOURCES",
-    "SURROGATE_MODES",
-    "TWINS",
-    "CaseEntry",
-    "Entry",
-    "Extra",
-    "FormatEntry",
-    "LogEntry",
-    "Metric",
-    "Need",
-    "PublicFile",
-    "SourceEntry",
-    "classes",
-    "lookup",
-    "make",
-    "metrics_with",
-    "resolve",
-]
+T = TypeVar("T")
 
 OPENED_CASE = "retwin.cases:get"
 """The function from the name of a case to the case, for models that name the case of their twin."""
 CASES: Mapping[str, CaseEntry] = {
     name: CaseEntry(
-        f"retwin.cases.{room}.case:{name}", title, f"retwin.cases.{room}.recorded:RECORDED"
+        f"retwin.cases.{room}.case:{name}", title, f"retwin.cases.{room}.{recorded}:RECORDED"
     )
-    for name, room, title in (
-        ("armpi", "armpi_fpv", "ArmPi FPV robot arm"),
-        ("tanks", "cascaded_tanks", "two cascaded tanks, without overflow"),
-        ("tanks_overflow", "cascaded_tanks", "two cascaded tanks that overflow"),
-        ("silverbox", "silver_box", "Silverbox, a linear twin of a cubic spring"),
-        ("incubator", "styrofoam_incubator", "incubator, a heater in a box of styrofoam"),
+    for name, room, recorded, title in (
+        ("armpi", "armpi_fpv", "recorded", "ArmPi FPV robot arm"),
+        ("tanks", "cascaded_tanks", "twin", "two cascaded tanks, without overflow"),
+        ("tanks_overflow", "cascaded_tanks", "twin", "two cascaded tanks that overflow"),
+        ("silverbox", "silver_box", "twin", "Silverbox, a linear twin of a cubic spring"),
+        ("incubator", "styrofoam_incubator", "twin", "incubator, a heater in a box of styrofoam"),
     )
 }
 """The built-in cases, by the names that `retwin.cases.get` and the command line take."""
@@ -463,3 +428,55 @@ def metrics_with(*marks: str, simulated: bool) -> tuple[str, ...]:
         for name, each in METRICS.items()
         if each.simulated == simulated and all(getattr(each, mark) for mark in marks)
     )
+
+
+def resolve(target: str) -> Any:
+    """The object that "package.module:object" names, installed or in the current folder.
+
+    Raises
+    ------
+    ImportError, AttributeError
+        There is no such module or object; for each entry of the catalog there is one.
+
+    """
+    module, _, attribute = target.partition(":")
+    return getattr(import_beside(module, Path.cwd()), attribute)
+
+
+def lookup(entries: Mapping[str, T], name: str, argument: str) -> T:
+    """The entry of that name.
+
+    Raises
+    ------
+    InputError
+        There is none; the message names `argument`.
+
+    """
+    return entries[one_of(argument, name, entries)]
+
+
+def make(entries: Mapping[str, Entry], name: str, argument: str) -> Any:
+    """The result of the target of that entry, called without arguments.
+
+    Raises
+    ------
+    InputError
+        There is no entry of that name; the message names `argument`.
+
+    """
+    return resolve(lookup(entries, name, argument).target)()
+
+
+def classes(entries: Mapping[str, Entry], base: type = object) -> tuple[type, ...]:
+    """The config classes of all entries: the kinds that a saved model may name.
+
+    Parameters
+    ----------
+    entries : mapping of str to Entry
+        Entries whose targets are config classes, or functions with `kinds`.
+    base : type
+        Only subclasses of this class, or classes with the methods of this protocol, are returned.
+
+    """
+    targets = [target for each in entries.values() for target in each.kinds or (each.target,)]
+    return tuple(kind for kind in map(resolve, targets) if issubclass(kind, base))
