@@ -11,18 +11,21 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.resources import files
 from importlib.util import find_spec
 from itertools import pairwise, product
 from pathlib import Path
+from typing import TypeVar
 
 from numpy.typing import NDArray
 
+from retwin.errors import brief
 from retwin.workers.threads import available, in_threads
 
+T = TypeVar("T")
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction and reassociation, results are those of torch up to single roundings."""
 NATIVE = "-march=native"
@@ -47,6 +50,22 @@ def compilers() -> Iterator[list[str]]:
             yield [found]
     if find_spec("ziglang"):
         yield [sys.executable, "-m", "ziglang", "cc"]
+
+
+def try_compilers(
+    make: Callable[[tuple[str, ...]], T], *flags: Sequence[str]
+) -> tuple[T | None, str]:
+    """What `make` returns for the first compiler and flags with which it raises no OSError.
+
+    Without one, None, and the reasons of all.
+    """
+    reasons = []
+    for command, own in product(compilers(), flags):
+        try:
+            return make((*command, *own)), ""
+        except OSError as error:
+            reasons.append(f"{command[0]}: {brief(error)}")
+    return None, "; ".join(reasons)
 
 
 @lru_cache(maxsize=COMPILED)
@@ -81,20 +100,15 @@ def compiled(source: str, *, contract: bool = False, quiet: bool = False) -> cty
         The loaded library, kept for as long as this process needs it.
 
     """
-    reasons = []
     flags = [*FLAGS, "-ffp-contract=fast"] if contract else [*FLAGS]
-    for command, native in product(compilers(), ([NATIVE], [])):
-        try:
-            return _library(source, (*command, *flags, *native))
-        except OSError as error:
-            reasons.append(f"{command[0]}: {error}")
-    if not quiet:
+    made, reasons = try_compilers(partial(_library, source), [*flags, NATIVE], flags)
+    if made is None and not quiet:
         warnings.warn(
             "the model runs in torch, some thousand times slower, since there is no C compiler "
-            f"({'; '.join(reasons) or 'none is installed'}); install one, or retwin[compiled]",
+            f"({reasons or 'none is installed'}); install one, or retwin[compiled]",
             stacklevel=2,
         )
-    return None
+    return made
 
 
 def build(command: Sequence[str], source: Path, library: Path) -> None:
