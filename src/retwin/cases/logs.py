@@ -10,8 +10,7 @@ import numpy as np
 
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
-from retwin.cases.matching import match_twin
-from retwin.cases.measured import usable
+from retwin.cases.matching import match_twin, usable
 from retwin.cases.named_signals import (
     Columns,
     check_named,
