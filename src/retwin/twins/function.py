@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import inspect
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import KW_ONLY, dataclass
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -190,59 +191,48 @@ class FunctionTwin:
         self, role: str, chunk: Chunk, commands: NDArray, rows: NDArray, seed: int
     ) -> list[_Call]:
         """The calls that give the outputs of those rows of the chunk, in order."""
-        function = getattr(self, role)
-        random = role == "function" and _takes(function, "rng")
-        options = {"rate": self.rate} if _takes(function, "rate") else {}
         if len(rows) == 0:
             return []
         parts = [rows] if self.vectorised else np.split(rows, len(rows))
-        return [
-            _Call(
-                function=function,
-                role=role,
-                # A copy, which the function may change.
-                commands=commands[part],
-                outputs=self.outputs,
-                ids=part + chunk.index.start,
-                single=not self.vectorised,
-                seed=seed if random else None,
-                options=options,
-            )
-            for part in parts
-        ]
+        # Each has a copy of its commands, which the function may change.
+        return [_Call(self, role, commands[p], p + chunk.index.start, seed) for p in parts]
 
 
 @dataclass(frozen=True, eq=False)
 class _Call:
     """One call of a user's function, for one trajectory or for many."""
 
-    function: Function
+    twin: FunctionTwin
     role: str
     commands: NDArray
-    outputs: Channels
     ids: NDArray
-    single: bool
-    seed: int | None
-    options: Mapping[str, float]
+    seed: int
+
+    @property
+    def function(self) -> Function:
+        """The function that is called."""
+        return getattr(self.twin, self.role)
 
     def outputs_of(self) -> NDArray:
         """Call the function and check its outputs (n, T, d_y)."""
-        given = self.commands[0] if self.single else self.commands
-        if self.seed is None:
-            returned = self.function(given, **self.options)
-        else:
+        many = self.twin.vectorised
+        options: dict[str, Any] = {}
+        if _takes(self.function, "rate"):
+            options["rate"] = self.twin.rate
+        if self.role == "function" and _takes(self.function, "rng"):
             # With a spawn key, since the severities of faults are drawn from the seed itself.
             sequence = np.random.SeedSequence(self.seed, spawn_key=(int(self.ids[0]),))
-            rng = np.random.default_rng(sequence)
-            returned = self.function(given, rng=rng, **self.options)
+            options["rng"] = np.random.default_rng(sequence)
+        returned = self.function(self.commands if many else self.commands[0], **options)
         outputs = self._numbers(returned)
-        outputs = outputs[None] if self.single else outputs
+        outputs = outputs if many else outputs[None]
         self._check_finite(outputs)
         return outputs
 
     def _numbers(self, returned: ArrayLike) -> NDArray:
         """What the function returned, as numbers of the right shape."""
-        shape = (*self.commands.shape[:2], len(self.outputs))[int(self.single) :]
+        single, outputs = not self.twin.vectorised, self.twin.outputs
+        shape = (*self.commands.shape[:2], len(outputs))[int(single) :]
         try:
             # A copy: the function may reuse its own array.
             values = np.array(returned)
@@ -250,9 +240,9 @@ class _Call:
         except (TypeError, ValueError, RuntimeError) as error:
             values = np.empty(0)
             got = " ".join(str(error).split())
-        names = ", ".join(self.outputs.names)
+        names = ", ".join(outputs.names)
         other = "vectorised=False if it takes one trajectory, (T, d_u)"
-        if self.single:
+        if single:
             other = "vectorised=True if it takes many trajectories, (n, T, d_u)"
         require(
             values.shape == shape and values.dtype.kind in "fiub",
@@ -271,7 +261,7 @@ class _Call:
             raise InputError(
                 self.role,
                 expected=f"{_name(self.function)} to return finite numbers",
-                got=f"{outputs[row, sample, channel]} for {self.outputs.names[channel]} in "
+                got=f"{outputs[row, sample, channel]} for {self.twin.outputs.names[channel]} in "
                 f"trajectory {self.ids[row]}, sample {sample}",
                 remedy="repair the function, or give limits that exclude such commands",
             )
@@ -298,7 +288,7 @@ def _outputs(calls: Sequence[_Call], pool: ProcessPool | None, chunk: Chunk) -> 
             chunk.failed[int(call.ids[0]) - chunk.index.start] = (
                 f"the process of {_name(call.function)} died, exit code {error.exitcode}"
             )
-            yield np.zeros((*call.commands.shape[:2], len(call.outputs)))
+            yield np.zeros((*call.commands.shape[:2], len(call.twin.outputs)))
 
 
 def _in_worker(pickled: bytes, role: str) -> NDArray:

@@ -353,22 +353,19 @@ def simulate_in_chunks(
     segments = Segments.from_commands(commands)
     faults = [None] * len(commands) if faults is None else faults
     drawn = draw_faults(faults, segments, seed, rate=twin.rate)
-    collected = Collected.empty(commands, twin.outputs, twin.rate)
+    collected = Collected(commands, twin.inputs, twin.outputs, twin.rate)
     turns = Turns()
 
     def run_chunk(begin: int) -> float:
-        index = slice(begin, begin + size)
-        own_commands, own_faults, own_segments = commands[index], drawn[index], segments[index]
-        effective = faulty_commands(own_commands, own_faults, own_segments, rate=twin.rate)
-        turn = turns.turn(begin // size)
-        chunk = Chunk(
-            index, own_commands, effective, own_faults, own_segments, twin.rate, turn=turn
-        )
+        index, rate = slice(begin, begin + size), twin.rate
+        clean, own, parts = commands[index], drawn[index], segments[index]
+        effective = faulty_commands(clean, own, parts, rate=rate)
+        chunk = Chunk(index, clean, effective, own, parts, rate, turn=turns.turn(begin // size))
         try:
             nominal, healthy = run(chunk)
         finally:
             turns.over(begin // size)
-        observed = measured_with(healthy, own_faults, twin.rate)
+        observed = measured_with(healthy, own, rate)
         collected.put(index, nominal, observed, chunk.failed, chunk.known)
         return min(1.0, (begin + size) / len(commands))
 
@@ -377,4 +374,4 @@ def simulate_in_chunks(
             progress(share)
     labels = np.array([HEALTHY if fault is None else fault.label for fault in drawn])
     source = f"{type(twin).__name__} seed={seed}"
-    return collected.trajectories(labels, twin.inputs, source=source, emulated=emulated)
+    return collected.trajectories(labels, source=source, emulated=emulated)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.arrays import interpolated
-from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault
@@ -66,41 +65,30 @@ class CommandSide(TwinWrapper):
         commands = checked_commands(commands, self.inputs)
         count = len(commands)
         offsets = tuple(f"{OFFSET}.{name}" for name in self.inputs.names)
-        given = dict(parameters or {})
-        own = {name: given.pop(name) for name in (DELAY, *offsets) if name in given}
-        own_values = values_per_simulation(own, count, allowed=(DELAY, *offsets))
-        inner_values = values_per_simulation(given, count)
-        delay = own_values.get(DELAY, np.zeros(count))
-        offset = np.stack([own_values.get(name, np.zeros(count)) for name in offsets], axis=-1)
+        values = values_per_simulation(parameters, count)
+        delay = values.pop(DELAY, np.zeros(count))
+        offset = np.stack([values.pop(name, np.zeros(count)) for name in offsets], axis=-1)
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rows = np.arange(len(chunk.commands))
-            options = {name: each[chunk.index] for name, each in inner_values.items()}
+            options = {name: each[chunk.index] for name, each in values.items()}
             late = delay[chunk.index, None] * self.rate
             delayed = interpolated(chunk.faulty_commands, np.arange(commands.shape[1]) - late)
-            effective = self._clip(delayed + offset[chunk.index][:, None])
-            responses: list[Fault | None] = [
-                None if fault is None else _ResponseOnly(fault) for fault in chunk.faults
-            ]
-            simulate = partial(
-                simulate_chunk, self.twin, chunk, rows, seed=seed, parameters=options
-            )
-            _, observed = simulate(effective, responses)
+            effective = delayed + offset[chunk.index][:, None]
+            if self.limits is not None:  # an actuator goes no further
+                effective = np.clip(effective, self.limits.low, self.limits.high)
+            responses = [fault and _ResponseOnly(fault) for fault in chunk.faults]
+            given: Any = {"seed": seed, "parameters": options}
+            _, observed = simulate_chunk(self.twin, chunk, rows, effective, responses, **given)
             if self.nominal is not None:
                 return nominal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
-            healthy: list[Fault | None] = [None] * len(rows)
-            nominal, _ = simulate(chunk.commands, healthy)
+            healthy = [None] * len(rows)
+            nominal, _ = simulate_chunk(self.twin, chunk, rows, faults=healthy, **given)
             return nominal, observed
 
         return simulate_in_chunks(
             self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )
-
-    def _clip(self, commands: NDArray) -> NDArray:
-        """Commands (n, T, d_u) within the twin's limits: an actuator goes no further."""
-        if self.limits is None:
-            return commands
-        return np.clip(commands, self.limits.low, self.limits.high)
 
 
 def command_side_parameters(
@@ -132,7 +120,7 @@ def command_side_parameters(
 
 
 @dataclass(frozen=True)
-class _ResponseOnly:
+class _ResponseOnly(Fault):
     """A fault without its effect on the reference, which has been applied already."""
 
     fault: Fault
@@ -147,10 +135,6 @@ class _ResponseOnly:
     ) -> _ResponseOnly:
         """The fault itself: its severity is fixed already."""
         return self
-
-    def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
-        """The commands unchanged."""
-        return commands
 
     def response(self, response: NDArray, rate: float) -> NDArray:
         """The response with the fault."""
