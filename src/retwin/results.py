@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from retwin.checks import require
 from retwin.errors import InputError
-from retwin.serialisation.files import read_json
+from retwin.serialisation.files import read_json, refusing
 from retwin.source_results import (
     Comparison,
     CurvePoint,
@@ -330,14 +330,8 @@ def read_results(folder: str | os.PathLike[str]) -> Results:
         got=f"{folder}, which has none",
         remedy=again,
     )
-    try:
+    with refusing("results.json", expected="JSON", remedy=again):
         content = read_json(path)
-    except InputError:
-        raise
-    except (ValueError, OSError) as error:
-        raise InputError(
-            "results.json", expected="JSON", got=f"{path} ({error})", remedy=again
-        ) from error
     schema = content.get("schema") if isinstance(content, dict) else None
     require(
         schema == SCHEMA,

@@ -14,10 +14,14 @@ from retwin.compiler import c_source
 from retwin.deploy.fmu.description import Variable, variables_of
 from retwin.deploy.fmu.text import Text, constants
 from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.limits import Limits
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of
+
+UNUSED = ("start_deviation", "process", "proportional", "free_process")
+"""Variances of corrected dynamics that equations without a discrepancy do not have."""
 
 
 def states_text(twin: StateTwin | DynamicsTwin | CorrectedTwin) -> Text:
@@ -60,36 +64,22 @@ def _convert(given: StateTwin | CorrectedTwin) -> DynamicsTwin:
         values = np.array([named[name] for name in twin.names])
         residual: Any = given.residual
         noise = (residual.spread * residual.scale).double().numpy() ** 2
-    names = twin.names
-    states, inputs = len(twin.states), len(twin.inputs)
-    limits = twin.limits
-    low, high = (
-        (np.zeros(inputs), np.zeros(inputs))
-        if limits is None
-        else (np.array(limits.low, float), np.array(limits.high, float))
-    )
-    starts = values[len(names) - states :]
-    middle = np.clip(0.0, low, high)
-    domain = Domain(
-        np.concatenate([starts, low]),
-        np.concatenate([starts, high]),
-        np.concatenate([starts, middle]),
-        np.ones(states),
-    )
-    nothing = np.zeros(states)
+    states, width = len(twin.states), len(twin.outputs)
+    limits = twin.limits or Limits(*((0.0,) * len(twin.inputs),) * 2)
+    low, high = np.array(limits.low, float), np.array(limits.high, float)
+    starts, middle = values[len(values) - states :], np.clip(0.0, low, high)
+    unused: Any = dict.fromkeys(UNUSED, np.zeros(states))
+    ranges = [*(np.concatenate([starts, each]) for each in (low, high, middle)), np.ones(states)]
     return DynamicsTwin(
-        twin,
-        values,
-        np.zeros((len(values), 0)),
-        nothing,
-        nothing,
-        nothing,
-        nothing,
-        noise,
-        np.ones(len(twin.outputs)),
-        np.zeros(len(twin.outputs)),
-        domain,
-        (),
+        equations=twin,
+        values=values,
+        factor=np.zeros((len(values), 0)),
+        **unused,
+        noise=noise,
+        widening=np.ones(width),
+        constant=np.zeros(width),
+        domain=Domain(*ranges),
+        corrected=(),
         case=getattr(given, "case", ""),
     )
 
