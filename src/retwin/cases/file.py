@@ -27,14 +27,7 @@ from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.nets.networks import Network
 from retwin.nets.training import Training
-from retwin.serialisation.configs import (
-    at,
-    checked,
-    fits,
-    from_config,
-    from_settings,
-    key,
-)
+from retwin.serialisation.configs import at, checked, fits, from_config, from_settings, key
 from retwin.serialisation.places import real_path
 from retwin.times import sample_rate
 from retwin.twins.commands.record_sampler import sampler_from

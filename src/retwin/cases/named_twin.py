@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from retwin import twins
+from retwin.catalog.modules import import_beside
 from retwin.checks import at_most, existing, nothing, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
-from retwin.modules import import_beside
 from retwin.serialisation.configs import at, checked, from_settings, key
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.fmu.twin import FMUTwin
@@ -87,12 +87,7 @@ def imported(name: Any, folder: Path, place: str) -> Any:
 
 
 def read_twin(
-    twin: Any,
-    inputs: Named,
-    outputs: Named,
-    rate: float | None,
-    folder: Path,
-    place: str,
+    twin: Any, inputs: Named, outputs: Named, rate: float | None, folder: Path, place: str
 ) -> Twin:
     """The twin that a text names, or a table that holds its name and its settings.
 

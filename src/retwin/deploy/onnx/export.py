@@ -121,10 +121,7 @@ def _check_exportable(bundle: Bundle) -> None:
     """Raise InputError that names the first part without a graph, and the reason."""
     surrogate, residual, diagnoser = bundle.twin.surrogate, bundle.twin.residual, bundle.diagnoser
     parts = (
-        (
-            isinstance(surrogate, Surrogate),
-            "twin in place of a surrogate: it is no network",
-        ),
+        (isinstance(surrogate, Surrogate), "twin in place of a surrogate: it is no network"),
         (
             isinstance(getattr(surrogate, "config", None), MLP | TCN),
             "surrogate without one: it has a state, which torch unrolls over all samples",

@@ -310,11 +310,7 @@ def _check_same(where: Path, written: dict[str, Any], given: dict[str, Any]) -> 
     if versions:
         remedy = "give another name, remove that folder, or finish it with that version"
     require(
-        not other,
-        "plan",
-        expected=f"the plan that {where} was begun with",
-        got=got,
-        remedy=remedy,
+        not other, "plan", expected=f"the plan that {where} was begun with", got=got, remedy=remedy
     )
 
 

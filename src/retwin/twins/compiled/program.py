@@ -168,10 +168,7 @@ def _partials(program: Program, node: Node) -> tuple[Partial, ...]:
             # 0 to a positive power is 0 for every such power.
             lambda: node * n("where", n("eq", a, 0.0), 0.0, n("log", a)),
         ),
-        "atan2": (
-            lambda: n("div", b, a * a + b * b),
-            lambda: n("neg", n("div", a, a * a + b * b)),
-        ),
+        "atan2": (lambda: n("div", b, a * a + b * b), lambda: n("neg", n("div", a, a * a + b * b))),
         "exp": (lambda: node,),
         "expm1": (lambda: n("add", node, 1.0),),
         "log": (lambda: n("div", 1.0, a),),

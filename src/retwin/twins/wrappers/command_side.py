@@ -13,13 +13,7 @@ from retwin.arrays import interpolated
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault
-from retwin.twins.twin import (
-    Chunk,
-    Twin,
-    checked_commands,
-    nominal_outputs,
-    simulate_in_chunks,
-)
+from retwin.twins.twin import Chunk, Twin, checked_commands, nominal_outputs, simulate_in_chunks
 from retwin.twins.wrappers.parameter_values import values_per_simulation
 from retwin.twins.wrappers.parametric import Parameter
 from retwin.twins.wrappers.rebuilt import TRAJECTORIES_PER_CHUNK

@@ -4,6 +4,9 @@ An entry states a name, a title and where the implementation is, as `package.mod
 implementation is imported when it is resolved, so that the command line, its completion, the
 report and the documentation read this module without waiting for torch. To add an implementation,
 write its module and add one entry here.
+
+Belongs here: names, titles, the kinds of entries, and how modules are found by their names. Not
+here: implementations.
 """
 
 from __future__ import annotations
@@ -12,8 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from retwin.checks import one_of
-from retwin.entries import (
+from retwin.catalog.entries import (
     CaseEntry,
     Entry,
     Extra,
@@ -24,7 +26,8 @@ from retwin.entries import (
     PublicFile,
     SourceEntry,
 )
-from retwin.modules import import_beside
+from retwin.catalog.modules import import_beside
+from retwin.checks import one_of
 
 T = TypeVar("T")
 
@@ -225,7 +228,7 @@ DOWNLOADS: Mapping[str, PublicFile] = {
         "HEAD/mydataset/my_dataset_test.mat",
         sha256="5d87fcdba86f6000dee5b7ec31a6e9a72276a9c4ff0b3a67d39a821cc5931b67",
         file="armpi/my_dataset_test.mat",
-    ),
+    )
 }
 """Public files by the names of their cases, which `retwin.data.fetch` takes."""
 

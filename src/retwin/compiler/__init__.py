@@ -1,4 +1,8 @@
-"""The C compiler: C99 source as functions of arrays."""
+"""The C compiler: C99 source as functions of arrays.
+
+Belongs here: finding a compiler, compiling once per machine, calls. Not here: C source, which lies
+beside the modules that describe the same in torch; `kernel.h` stands above it.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +78,7 @@ def compiled_files(package: str, *names: str, contract: bool = False) -> ctypes.
 
     The files need no declarations: `kernel.h` stands above them. `contract` is that of `compiled`.
     """
-    source = c_source("retwin", "kernel.h") + c_source(package, *names)
+    source = c_source(__package__, "kernel.h") + c_source(package, *names)
     return compiled(source, contract=contract, quiet=True)
 
 
