@@ -181,10 +181,7 @@ def _actuators(
         plant = ScriptedNetwork(twin.surrogate)
     step = ActuatorStep(
         plant,
-        gain=found.gain,
-        centre=found.centre,
-        low=found.low,
-        high=found.high,
+        found,
         tolerance=torch.as_tensor(still, dtype=torch.float32),
         speed=torch.as_tensor(change * twin.rate * period, dtype=torch.float32),
         # A motion of the twin ends when a sample equals the one before.
@@ -192,7 +189,7 @@ def _actuators(
     )
     delay = found.delay / period
     length = math.floor(float(delay.max())) + 2
-    return Actuators(step, delay, found.offset, found.probability, length).eval()
+    return Actuators(step, delay, found, length).eval()
 
 
 class ScriptedNetwork(nn.Module):

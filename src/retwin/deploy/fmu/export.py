@@ -120,16 +120,11 @@ def export_fmu(
     head = f'#include "{fmi}Functions.h"\n#define TOKEN "{token}"\ntypedef {fmi}Boolean Boolean;'
     source = "\n".join([text.source, head, c_source(__package__, "interface.c", f"{fmi}.c")])
     headers = Path(str(fmpy.__file__)).parent / "c-code"
+    # A twin knows its case by the path of its file, which concerns nobody else.
+    about = Path(text.about).stem if os.path.isabs(text.about) else text.about or path.stem
+    described = description(version, identifier, token, about, text.variables, 1 / text.rate)
     content: dict[str, bytes] = {
-        "modelDescription.xml": description(
-            version,
-            identifier,
-            token,
-            # A twin knows its case by the path of its file, which concerns nobody else.
-            Path(text.about).stem if os.path.isabs(text.about) else text.about or path.stem,
-            text.variables,
-            1 / text.rate,
-        ),
+        "modelDescription.xml": described,
         f"sources/{identifier}.c": source.encode(),
         **{f"sources/{name}": (headers / name).read_bytes() for name in HEADERS[version]},
     }
