@@ -73,7 +73,6 @@ class _Columns:
 class CaseFile(TwinKeys):
     """The keys of a case.toml; see docs/own_twin.md."""
 
-    name: str
     title: str = ""
     folder: str = ""
     sensor_rate: float | None = None

@@ -84,8 +84,9 @@ def imported(name: Any, folder: Path, place: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class TwinKeys:
-    """The keys of a case.toml from which its twin is made."""
+    """The keys of a case.toml from which its twin is made, and the name of the case."""
 
+    name: str
     twin: Any
     rate: float | None = None
     inputs: dict[str, Any] | tuple[str, ...] = ()
