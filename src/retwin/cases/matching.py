@@ -147,22 +147,6 @@ def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -
         None is healthy, a number stands for a missing measurement, or no output is left.
 
     """
-    joined = _healthy(found, notes)
-    _check_size(joined)
-    if transient:
-        joined = _mask_transient(joined, transient)
-    unseen = ~joined.mask.any(axis=(0, 1))
-    if unseen.any():
-        lacking = ", ".join(np.array(joined.outputs.names)[unseen])
-        notes[f"No log holds {lacking}."] = []
-    constant = ", ".join(_constant(joined))
-    if constant:
-        notes[f"{constant}: {CONSTANT}"] = []
-    return joined
-
-
-def _healthy(found: Trajectories, notes: dict[str, list[str]]) -> Trajectories:
-    """The healthy and the unlabelled trajectories; InputError if there is none."""
     kept = found.maybe_healthy
     require(
         kept.any(),
@@ -173,7 +157,26 @@ def _healthy(found: Trajectories, notes: dict[str, list[str]]) -> Trajectories:
     )
     if not kept.all():
         notes[f"{int((~kept).sum())} trajectories of other classes are not used."] = []
-    return found[kept]
+    joined = found[kept]
+    _check_size(joined)
+    mask = joined.mask.copy()
+    mask[:, : round(transient * joined.rate)] = False
+    require(
+        mask.any() or not transient,
+        "transient",
+        expected=f"less than the {joined.steps / joined.rate:g} s of the longest trajectory",
+        got=f"{transient:g} s",
+        remedy="give a shorter transient",
+    )
+    joined = joined.replace(mask=mask)
+    unseen = ~joined.mask.any(axis=(0, 1))
+    if unseen.any():
+        lacking = ", ".join(np.array(joined.outputs.names)[unseen])
+        notes[f"No log holds {lacking}."] = []
+    constant = ", ".join(_constant(joined))
+    if constant:
+        notes[f"{constant}: {CONSTANT}"] = []
+    return joined
 
 
 def _check_size(found: Trajectories, *, largest: float = 1e30) -> None:
@@ -208,17 +211,3 @@ def _constant(found: Trajectories) -> list[str]:
         for name, each in zip((*found.inputs.names, *found.outputs.names), every, strict=True)
         if np.isfinite(each).any() and float(np.nanmax(each)) == float(np.nanmin(each))
     ]
-
-
-def _mask_transient(found: Trajectories, transient: float) -> Trajectories:
-    """The trajectories without their outputs in the first seconds."""
-    mask = found.mask.copy()
-    mask[:, : round(transient * found.rate)] = False
-    require(
-        mask.any(),
-        "transient",
-        expected=f"less than the {found.steps / found.rate:g} s of the longest trajectory",
-        got=f"{transient:g} s",
-        remedy="give a shorter transient",
-    )
-    return found.replace(mask=mask)
