@@ -147,16 +147,11 @@ class FunctionTwin:
             pool = cache(lambda: stack.enter_context(self._workers()) if self.workers > 1 else None)
 
             def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-                return self._run(pool(), chunk, seed, report)
+                return self._run(pool(), chunk, report)
 
+            size = TRAJECTORIES_PER_CHUNK
             return simulate_in_chunks(
-                self,
-                run,
-                commands,
-                faults,
-                seed=seed,
-                progress=progress,
-                size=TRAJECTORIES_PER_CHUNK,
+                self, run, commands, faults, seed=seed, progress=progress, size=size
             )
 
     def _workers(self) -> AbstractContextManager[ProcessPool]:
@@ -165,7 +160,7 @@ class FunctionTwin:
         return worker_processes(key, lambda: worker_pool(self.workers))
 
     def _run(
-        self, pool: ProcessPool | None, chunk: Chunk, seed: int, report: Callable
+        self, pool: ProcessPool | None, chunk: Chunk, report: Callable
     ) -> tuple[NDArray, NDArray]:
         """Nominal and observed outputs of a chunk."""
         held = chunk.held_commands
@@ -175,8 +170,8 @@ class FunctionTwin:
         if self.nominal is None:
             faulty = np.flatnonzero((held != chunk.commands).any(axis=(1, 2)))
         ideal = "function" if self.nominal is None else "nominal"
-        clean = self._calls(ideal, chunk, chunk.commands, every, seed)
-        calls = [*clean, *self._calls("function", chunk, held, faulty, seed)]
+        clean = self._calls(ideal, chunk, chunk.commands, every)
+        calls = [*clean, *self._calls("function", chunk, held, faulty)]
         outputs = []
         for output in _outputs(calls, pool, chunk):
             outputs.append(output)
@@ -187,15 +182,13 @@ class FunctionTwin:
             observed[faulty] = np.concatenate(outputs[len(clean) :])
         return nominal, observed
 
-    def _calls(
-        self, role: str, chunk: Chunk, commands: NDArray, rows: NDArray, seed: int
-    ) -> list[_Call]:
+    def _calls(self, role: str, chunk: Chunk, commands: NDArray, rows: NDArray) -> list[_Call]:
         """The calls that give the outputs of those rows of the chunk, in order."""
         if len(rows) == 0:
             return []
         parts = [rows] if self.vectorised else np.split(rows, len(rows))
         # Each has a copy of its commands, which the function may change.
-        return [_Call(self, role, commands[p], p + chunk.index.start, seed) for p in parts]
+        return [_Call(self, role, commands[p], p + chunk.index.start, chunk.seed) for p in parts]
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,6 +75,13 @@ class Program:
         """The variable of that C name."""
         return self._intern("variable", (), name)
 
+    def variables(self, **sizes: int) -> dict[str, tuple[Node, ...]]:
+        """Variables x[0], x[1], … of each array of C and its size."""
+        return {
+            letter: tuple(self.variable(f"{letter}[{i}]") for i in range(size))
+            for letter, size in sizes.items()
+        }
+
     def constant(self, value: float) -> Node:
         """The constant of that value."""
         return self._intern("constant", (), float(value))
