@@ -92,11 +92,8 @@ def _variables(twin: DynamicsTwin, ranged: bool) -> tuple[list[Variable], list[i
     # Coefficients of the discrepancy have names of several words.
     shown = [each.name.isidentifier() for each in equations.parameters]
     values = twin.values.tolist()
-    parameters = [
-        (each, value)
-        for each, value, own in zip(equations.parameters, values, shown, strict=False)
-        if own
-    ]
+    pairs = zip(equations.parameters, values, strict=False)
+    parameters = [pair for pair, own in zip(pairs, shown, strict=True) if own]
     starts = [
         (each.name, each.unit, value)
         for each, value in zip(equations.states, values[-states:], strict=True)
@@ -107,12 +104,9 @@ def _variables(twin: DynamicsTwin, ranged: bool) -> tuple[list[Variable], list[i
     first = twin.domain.mean[states:].tolist()
     channels = (equations.inputs, equations.outputs)
     made = variables_of(*channels, first, parameters, starts, limits=limits, ranged=ranged)
-    following = 1 + 2 * inputs + 5 * outputs
-    places = []
-    for own in [*shown, *[True] * states]:
-        places.append(following if own else -1)
-        following += own
-    return made, places
+    listed = np.array([*shown, *[True] * states])
+    places = np.where(listed, 2 * inputs + 5 * outputs + listed.cumsum(), -1)
+    return made, places.tolist()
 
 
 def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
@@ -129,7 +123,6 @@ def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
         "ND": len(delays),
         "PAST": 3 + ceil(max(longest, default=0.0) * twin.rate),
     }
-    numbers = {"PERIOD": 1 / twin.rate}
     arrays: Mapping[str, ArrayLike] = {
         "VALUES": twin.values,
         "FACTOR": twin.factor.ravel(),
@@ -146,7 +139,7 @@ def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
         arrays = {**arrays, "LEAST": low, "GREATEST": high}
     lines = [f"#define {name} {size}" for name, size in sizes.items()]
     lines += ["#define RANGED"] * ranged
-    lines += [f"#define {name} {value!r}" for name, value in numbers.items()]
+    lines.append(f"#define PERIOD {1 / twin.rate!r}")
     lines += [constants(name, values) for name, values in arrays.items()]
     indices = {"PLACE": places, "DELAYED": [u for u, _ in delays], "DEAD": [p for _, p in delays]}
     lines += [constants(name, values, "int") for name, values in indices.items()]
