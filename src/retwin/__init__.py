@@ -53,134 +53,14 @@ as in `rt.twins.HoldSampler` or `from retwin.deploy import Bundle`:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from retwin._lazy import homes, names
+from retwin._lazy import listed, names
 from retwin._version import __version__
 
-# Name to module, which is imported when the name is first used: `import retwin` loads no torch.
-_HOME = homes(
-    {
-        "cases.case": "Case",
-        "data.download": "fetch",
-        "data.io": "load save",
-        "data.segments": "Segments",
-        "data.trajectories": "Channels Trajectories",
-        "deploy.actuator.export": "export_actuator",
-        "diagnosis": "DANN Diagnoser FineTune NetworkDiagnoser Rocket fit_diagnoser fit_inversion "
-        "load_diagnoser",
-        "errors": "InputError",
-        "evaluation": "Choice fit score_model",
-        "evaluation.diagnosers": "evaluate",
-        "evaluation.experiments.propose": "next_experiments",
-        "evaluation.fidelity": "measure_fidelity",
-        "nets.networks": "CNN LSTM LSTMClassifier MLP StateSpace TCN",
-        "nets.training": "Training",
-        "report": "write_report",
-        "study": "StudyData StudyPlan run_study",
-        "twins.collected": "SimulationError",
-        "twins.faults.actuator_faults": "ActuatorBias Fault Stuck",
-        "twins.fmu.twin": "FMUTwin",
-        "twins.function": "FunctionTwin",
-        "twins.limits": "Limits",
-        "twins.mujoco.twin": "MuJoCoTwin",
-        "twins.wrappers.parametric": "Parameter ParametricTwin",
-        "twins.twin": "Twin",
-        "update.corrected": "CorrectedTwin generate",
-        "update.corrections": "Additive Chain CommandSpace Context Correction DelayOffset "
-        "Discrepancy SampledSensor",
-        "update.identification": "identify",
-        "update.loading": "load_twin",
-        "update.residual": "Flow Mixture Refinement ResidualModel SequenceMixture fit_residual "
-        "infer_discrepancy",
-        "update.surrogate": "Surrogate fit_surrogate",
-    }
-)
-
-# The rooms that users reach as `rt.<room>`.
-_ROOMS = tuple(
-    homes(
-        {
-            "": "cases data deploy diagnosis evaluation monitor nets report scores study testing "
-            "twins update"
-        }
-    )
-)
+# The stub beside this file lists the public names. The module of a name is imported when the name
+# is first used: `import retwin` loads no torch.
+_LISTED = listed(__loader__.get_data(f"{__file__}i").decode())
+_HOME = {n: m.removeprefix("retwin.") for n, m in sorted(_LISTED.items()) if m.count(".")}
+_ROOMS = tuple(sorted(_LISTED.keys() - _HOME.keys()))
 
 __all__ = ["__version__", *_ROOMS, *_HOME]
 __getattr__, __dir__, _ = names("retwin", _HOME)
-
-if TYPE_CHECKING:
-    from retwin import (
-        cases,
-        data,
-        deploy,
-        diagnosis,
-        evaluation,
-        monitor,
-        nets,
-        report,
-        scores,
-        study,
-        testing,
-        twins,
-        update,
-    )
-    from retwin.cases.case import Case
-    from retwin.data.download import fetch
-    from retwin.data.io import load, save
-    from retwin.data.segments import Segments
-    from retwin.data.trajectories import Channels, Trajectories
-    from retwin.deploy.actuator.export import export_actuator
-    from retwin.diagnosis import (
-        DANN,
-        Diagnoser,
-        FineTune,
-        NetworkDiagnoser,
-        Rocket,
-        fit_diagnoser,
-        fit_inversion,
-        load_diagnoser,
-    )
-    from retwin.errors import InputError
-    from retwin.evaluation import Choice, fit, score_model
-    from retwin.evaluation.diagnosers import evaluate
-    from retwin.evaluation.experiments.propose import next_experiments
-    from retwin.evaluation.fidelity import measure_fidelity
-    from retwin.nets.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, StateSpace
-    from retwin.nets.training import Training
-    from retwin.report import write_report
-    from retwin.study import StudyData, StudyPlan, run_study
-    from retwin.twins.collected import SimulationError
-    from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
-    from retwin.twins.fmu.twin import FMUTwin
-    from retwin.twins.function import FunctionTwin
-    from retwin.twins.limits import Limits
-    from retwin.twins.mujoco.twin import MuJoCoTwin
-    from retwin.twins.twin import Twin
-    from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
-    from retwin.update.corrected import CorrectedTwin, generate
-    from retwin.update.corrections import (
-        Additive,
-        Chain,
-        CommandSpace,
-        Context,
-        Correction,
-        DelayOffset,
-        Discrepancy,
-        SampledSensor,
-    )
-    from retwin.update.identification import (
-        identify,
-    )
-    from retwin.update.loading import load_twin
-    from retwin.update.residual import (
-        Flow,
-        Mixture,
-        Refinement,
-        ResidualModel,
-        SequenceMixture,
-        fit_residual,
-        infer_discrepancy,
-    )
-    from retwin.update.surrogate import Surrogate, fit_surrogate

@@ -36,6 +36,10 @@ class InputError(ValueError):
         self.got = got
         self.remedy = remedy
 
+    def with_parts(self, *, got: str = "", remedy: str = "") -> InputError:
+        """The same error with another part."""
+        return rebuild(self.argument, self.expected, got or self.got, remedy or self.remedy)
+
     def __reduce__(self) -> tuple:
         """Keep the parts when the error is sent to another process."""
         return rebuild, (self.argument, self.expected, self.got, self.remedy)

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 import retwin as rt
-from retwin.cases.measured import CONSTANT
+from retwin.cases.matching import CONSTANT
 from retwin.evaluation import hold_out, validate_identification
 from retwin.evaluation.identification.parameters import estimates
 from retwin.report.identification.texts import findings, interval_remark, state

@@ -18,7 +18,7 @@ from retwin.report.labels import (
     span,
 )
 from retwin.report.style import CHROME, PALETTE, colour_index, dash, symbol
-from retwin.source_results import Comparison
+from retwin.results.sources import Comparison
 
 
 def contrast(one: str, other: str) -> float:

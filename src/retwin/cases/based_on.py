@@ -64,11 +64,8 @@ def merge_bases(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any
     for name, value in settings.items():
         old = inner.get(name)
         if name == "parameters" and isinstance(old, Mapping) and isinstance(value, Mapping):
-            changed = {
-                each: {**old.get(each, {}), **new} if isinstance(new, Mapping) else new
-                for each, new in value.items()
-            }
-            value = {**old, **changed}
+            tables = {each: new for each, new in value.items() if isinstance(new, Mapping)}
+            value = {**old, **value, **{each: old.get(each, {}) | t for each, t in tables.items()}}
         inner[name] = value
     return inner, home
 
@@ -106,14 +103,8 @@ def updated_built_in(base: str, settings: Mapping[str, Any], place: str) -> Case
         records = made.records
         if isinstance(records, ColumnRecords):
             records = replace(records, twin=twin)
-        return replace(
-            made,
-            name=keys.name or made.name,
-            title=keys.title or made.title,
-            twin=twin,
-            parametric=twin,
-            records=records,
-        )
+        made = replace(made, name=keys.name or made.name, title=keys.title or made.title)
+        return replace(made, twin=twin, parametric=twin, records=records)
 
 
 def parameters_of(tables: Mapping[str, Any], inside: str) -> list[Parameter]:

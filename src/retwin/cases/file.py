@@ -20,21 +20,20 @@ from retwin.cases.based_on import merge_bases, parameters_of, updated_built_in
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.named_signals import LogSettings
-from retwin.cases.named_twin import delayed_twin, imported, parametric_twin, read_twin
+from retwin.cases.named_twin import (
+    TwinKeys,
+    delayed_twin,
+    imported,
+    parametric_twin,
+    read_twin,
+)
 from retwin.checks import agree, one_of, require
 from retwin.data.io import load
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.nets.networks import Network
 from retwin.nets.training import Training
-from retwin.serialisation.configs import (
-    at,
-    checked,
-    fits,
-    from_config,
-    from_settings,
-    key,
-)
+from retwin.serialisation.configs import at, checked, fits, from_config, from_settings, key
 from retwin.serialisation.places import real_path
 from retwin.times import sample_rate
 from retwin.twins.commands.record_sampler import sampler_from
@@ -70,18 +69,13 @@ class _Columns:
     test: Any = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class CaseFile:
+@dataclass(frozen=True, kw_only=True)
+class CaseFile(TwinKeys):
     """The keys of a case.toml; see docs/own_twin.md."""
 
-    name: str
-    twin: Any
     title: str = ""
     folder: str = ""
-    rate: float | None = None
     sensor_rate: float | None = None
-    inputs: dict[str, Any] | tuple[str, ...] = ()
-    outputs: dict[str, Any] | tuple[str, ...] = ()
     delays: dict[str, dict[str, Any]] = field(default_factory=dict)
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     commands: dict[str, Any] | str = field(default_factory=dict)
@@ -118,7 +112,7 @@ def read_case(path: str | Path) -> Case:
     folder = home / keys.folder
     with at(key(place, "folder")):
         real_path(folder)
-    twin = read_twin(keys.twin, keys.inputs, keys.outputs, keys.rate, folder, place)
+    twin = read_twin(keys, folder, place)
     inside = key(place, "delays")
     tables = {f"delay_{name}": {"unit": "s", **each} for name, each in keys.delays.items()}
     delays = parameters_of(tables, inside)
@@ -338,22 +332,15 @@ def _records(value: _Columns | str | None, twin: Twin, folder: Path, place: str)
     if isinstance(value, str):
         function = imported(value, folder, place)
         return partial(_checked_split, function, twin, f"{place} ({value})")
-    sets = {
-        name: _record_list(getattr(value, name), key(place, name))
-        for name in ("calibration", "test")
-    }
+    sets = {}
+    for name, own in vars(value).items():  # a table of columns or of a record, or several
+        tables = own if isinstance(own, tuple) else (own,)
+        full = (isinstance(t, Mapping) and isinstance(t.get("columns"), Mapping) for t in tables)
+        settings = [t if whole else {"columns": t} for t, whole in zip(tables, full, strict=True)]
+        inside = key(place, name)
+        sets[name] = [from_settings(Record, each, place=inside) for each in settings]
     with at(place):
         return ColumnRecords(twin, **sets)
-
-
-def _record_list(value: Any, place: str) -> list[Record]:
-    """Records from a table of columns, a table of a `Record`, or several of these."""
-    tables = value if isinstance(value, tuple) else [value]
-    full = [isinstance(t, Mapping) and isinstance(t.get("columns"), Mapping) for t in tables]
-    return [
-        from_settings(Record, table if whole else {"columns": table}, place=place)
-        for table, whole in zip(tables, full, strict=True)
-    ]
 
 
 def _checked_split(

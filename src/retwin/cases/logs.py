@@ -10,8 +10,7 @@ import numpy as np
 
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
-from retwin.cases.matching import match_twin
-from retwin.cases.measured import usable
+from retwin.cases.matching import match_twin, usable
 from retwin.cases.named_signals import (
     Columns,
     check_named,
@@ -225,8 +224,9 @@ class LogReader:
         """The trajectories of one log, and those that the records of a case keep for the test."""
         mapping, names = self.columns.mapping, self.columns.names
         records = None if case is None or names or mapping is not None else case.records
-        if records is not None and (_is_table(path) or path.is_dir()):
-            if isinstance(records, ColumnRecords) and records.in_folder and path.is_file():
+        is_table = path.suffix.lower() == ".csv" and path.is_file()
+        if records is not None and (is_table or path.is_dir()):
+            if isinstance(records, ColumnRecords) and records.in_folder and is_table:
                 return records.of_file(path), []
             calibration, test = records(path)
             return calibration, [test]
@@ -301,10 +301,6 @@ def _sentences(notes: Mapping[str, Sequence[str]]) -> Iterator[str]:
     for text, files in notes.items():
         more = f" and {len(files) - 2} more" if len(files) > 2 else ""
         yield f"{', '.join(files[:2])}{more}: {text}." if files else text
-
-
-def _is_table(path: Path) -> bool:
-    return path.suffix.lower() == ".csv" and path.is_file()
 
 
 def _is_text(path: Path) -> bool:

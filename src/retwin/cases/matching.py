@@ -1,4 +1,4 @@
-"""Trajectories of a file as those of a twin: channels by name, units, and nominal outputs."""
+"""What was measured as trajectories of a twin: channels by name, units, and what is usable."""
 
 from __future__ import annotations
 
@@ -8,8 +8,12 @@ import numpy as np
 
 from retwin.cases.named_signals import check_there
 from retwin.checks import require
-from retwin.data.trajectories import Channels, Trajectories
+from retwin.data.trajectories import HEALTHY, Channels, Trajectories
+from retwin.errors import InputError
 from retwin.twins.twin import Twin
+
+CONSTANT = "constant in all logs, so that they show no dynamics of it."
+"""What is noted of channels that never change."""
 
 
 def match_twin(
@@ -122,4 +126,88 @@ def _units_taken(own: Channels, wanted: Channels, places: Sequence[int | None]) 
         f"{channel} ({own.units[at]})"
         for channel, unit, at in channels
         if at is not None and unit == "1" and own.units[at] != "1"
+    ]
+
+
+def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -> Trajectories:
+    """The healthy and the unlabelled trajectories, without their outputs in the first seconds.
+
+    Parameters
+    ----------
+    found : Trajectories
+        Those of all logs.
+    notes : dict of str to list of str
+        Takes notes about all logs together.
+    transient : float
+        Duration in s.
+
+    Raises
+    ------
+    InputError
+        None is healthy, a number stands for a missing measurement, or no output is left.
+
+    """
+    kept = found.maybe_healthy
+    require(
+        kept.any(),
+        "logs",
+        expected=f"a trajectory without a label, or labelled {HEALTHY}",
+        got=f"labels {', '.join(sorted(found.known_labels))}",
+        remedy="identify the parameters of a healthy system",
+    )
+    if not kept.all():
+        notes[f"{int((~kept).sum())} trajectories of other classes are not used."] = []
+    joined = found[kept]
+    _check_size(joined)
+    mask = joined.mask.copy()
+    mask[:, : round(transient * joined.rate)] = False
+    require(
+        mask.any() or not transient,
+        "transient",
+        expected=f"less than the {joined.steps / joined.rate:g} s of the longest trajectory",
+        got=f"{transient:g} s",
+        remedy="give a shorter transient",
+    )
+    joined = joined.replace(mask=mask)
+    unseen = ~joined.mask.any(axis=(0, 1))
+    if unseen.any():
+        lacking = ", ".join(np.array(joined.outputs.names)[unseen])
+        notes[f"No log holds {lacking}."] = []
+    constant = ", ".join(_constant(joined))
+    if constant:
+        notes[f"{constant}: {CONSTANT}"] = []
+    return joined
+
+
+def _check_size(found: Trajectories, *, largest: float = 1e30) -> None:
+    """Refuse numbers that stand for missing measurements.
+
+    Parameters
+    ----------
+    largest : float, default 1e+30
+        Magnitude from which a number is no measurement: programs write 3.4e38 for a missing one.
+
+    """
+    for name, values in (("observed", found.observed), ("commands", found.commands)):
+        large = np.argwhere(np.abs(values) >= largest)
+        channels = found.outputs if name == "observed" else found.inputs
+        if len(large):
+            row, sample, channel = large[0]
+            raise InputError(
+                str(found.ids[row]),
+                expected=f"numbers below {largest:g}",
+                got=f"{values[row, sample, channel]:g} for {channels.names[channel]} at "
+                f"{sample / found.rate:g} s",
+                remedy="leave the cell empty, or write NaN, where a measurement is missing",
+            )
+
+
+def _constant(found: Trajectories) -> list[str]:
+    """Channels that never change, among the commands and the outputs that were measured."""
+    values = np.where(found.mask, found.observed, np.nan)
+    every = np.moveaxis(np.concatenate([found.commands, values], axis=2), 2, 0)
+    return [
+        name
+        for name, each in zip((*found.inputs.names, *found.outputs.names), every, strict=True)
+        if np.isfinite(each).any() and float(np.nanmax(each)) == float(np.nanmin(each))
     ]

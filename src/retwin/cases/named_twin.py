@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from retwin import twins
+from retwin.catalog.modules import import_beside
 from retwin.checks import at_most, existing, nothing, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
-from retwin.modules import import_beside
 from retwin.serialisation.configs import at, checked, from_settings, key
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.fmu.twin import FMUTwin
@@ -45,10 +45,6 @@ class _Making:
 
     outside: Literal["refuse", "clip"] = "refuse"
     servos: dict[str, dict[str, Any]] = field(default_factory=dict)
-
-
-Named = Mapping[str, Any] | Sequence[str]
-"""Channels: a table of each, or names alone."""
 
 
 def imported(name: Any, folder: Path, place: str) -> Any:
@@ -86,14 +82,18 @@ def imported(name: Any, folder: Path, place: str) -> Any:
     return found
 
 
-def read_twin(
-    twin: Any,
-    inputs: Named,
-    outputs: Named,
-    rate: float | None,
-    folder: Path,
-    place: str,
-) -> Twin:
+@dataclass(frozen=True, kw_only=True)
+class TwinKeys:
+    """The keys of a case.toml from which its twin is made, and the name of the case."""
+
+    name: str
+    twin: Any
+    rate: float | None = None
+    inputs: dict[str, Any] | tuple[str, ...] = ()
+    outputs: dict[str, Any] | tuple[str, ...] = ()
+
+
+def read_twin(keys: TwinKeys, folder: Path, place: str) -> Twin:
     """The twin that a text names, or a table that holds its name and its settings.
 
     | name | takes |
@@ -110,38 +110,34 @@ def read_twin(
 
     """
     own = key(place, "twin")
-    options = dict(twin) if isinstance(twin, Mapping) else {"name": twin}
+    options = dict(keys.twin) if isinstance(keys.twin, Mapping) else {"name": keys.twin}
     name = options.pop("name", None)
     if not isinstance(name, str):
         raise InputError(
             own,
             expected=f"the name of a twin: {twins.FORMS}",
-            got=repr(twin),
+            got=repr(keys.twin),
             remedy='write twin = "NAME", or a table with a name in it',
         )
     if "nominal" in options:
         options["nominal"] = imported(options["nominal"], folder, key(own, "nominal"))
     if Path(name).suffix.lower() in FILES:
-        return _of_file(folder / name, inputs, outputs, rate, options, place)
+        return _of_file(folder / name, keys, options, place)
     found = imported(name, folder, own) if ":" in name else None
-    if callable(found) and (inputs or outputs):
-        return _of_function(found, inputs, outputs, rate, options, place)
+    if callable(found) and (keys.inputs or keys.outputs):
+        return _of_function(found, keys, options, place)
     expected = "a name alone, for such a twin has its own settings"
     nothing(own, options, expected, remedy="make the object with these settings")
+    inputs, outputs = tuple(keys.inputs), tuple(keys.outputs)
     with at(place):
-        return twins.get(name, inputs=tuple(inputs), outputs=tuple(outputs), rate=rate)
+        return twins.get(name, inputs=inputs, outputs=outputs, rate=keys.rate)
 
 
 def _of_function(
-    function: Any,
-    inputs: Named,
-    outputs: Named,
-    rate: float | None,
-    options: dict[str, Any],
-    place: str,
+    function: Any, keys: TwinKeys, options: dict[str, Any], place: str
 ) -> FunctionTwin:
-    commands = _channels(inputs, key(place, "inputs"))
-    results = _channels(outputs, key(place, "outputs"))
+    commands = _channels(keys.inputs, key(place, "inputs"))
+    results = _channels(keys.outputs, key(place, "outputs"))
     own = key(place, "twin")
     making = _making(options, own, "outside")
     settings = checked(FunctionTwin, options, place=own, besides=ELSEWHERE)
@@ -153,23 +149,17 @@ def _of_function(
             function,
             Channels(tuple(commands), tuple(each.unit for each in commands.values())),
             Channels(tuple(results), tuple(each.unit for each in results.values())),
-            rate,  # type: ignore[arg-type]  # None is refused there
+            keys.rate,  # type: ignore[arg-type]  # None is refused there
             limits=limits,
             **settings,
         )
 
 
-def _of_file(
-    file: Path,
-    inputs: Named,
-    outputs: Named,
-    rate: float | None,
-    options: dict[str, Any],
-    place: str,
-) -> Twin:
+def _of_file(file: Path, keys: TwinKeys, options: dict[str, Any], place: str) -> Twin:
     own, kind = key(place, "twin"), FILES[file.suffix.lower()]
     existing(own, file, file.is_file(), "a file")
-    for name, channels in (("inputs", inputs), ("outputs", outputs)):
+    chosen = {"inputs": keys.inputs, "outputs": keys.outputs}
+    for name, channels in chosen.items():
         require(
             not (isinstance(channels, Mapping) and any(channels.values())),
             key(place, name),
@@ -185,12 +175,11 @@ def _of_file(
             (joint, from_settings(Servo, value, place=key(inside, joint)))
             for joint, value in making.servos.items()
         ]
-    if rate is not None:
-        settings["rate"] = rate
+    settings |= {name: tuple(channels) for name, channels in chosen.items()}
+    if keys.rate is not None:
+        settings["rate"] = keys.rate
     with at(own):
-        return kind.from_file(
-            file, inputs=tuple(inputs), outputs=tuple(outputs), outside=making.outside, **settings
-        )
+        return kind.from_file(file, outside=making.outside, **settings)
 
 
 def _making(options: dict[str, Any], place: str, *names: str) -> _Making:
@@ -198,7 +187,9 @@ def _making(options: dict[str, Any], place: str, *names: str) -> _Making:
     return from_settings(_Making, {n: options.pop(n) for n in names if n in options}, place=place)
 
 
-def _channels(given: Named, place: str, *, max_channels: int = 10000) -> dict[str, _Channel]:
+def _channels(
+    given: Mapping[str, Any] | Sequence[str], place: str, *, max_channels: int = 10000
+) -> dict[str, _Channel]:
     """A table of each channel, for which its name alone may stand.
 
     Parameters

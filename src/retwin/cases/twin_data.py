@@ -87,12 +87,13 @@ def log_case(
 
     """
     is_file = Path(name).suffix.lower() in FILES
-    if not is_file and (":" not in name or _is_case(name)):
+    found = _object(name) if ":" in name and not is_file else None
+    if not is_file and (":" not in name or _is_case(found)):
         expected = "none of them, since the case has its own"
         nothing("inputs, outputs", (*inputs, *outputs), expected, remedy="leave them out")
         return cases.data_case(name)
     # A function has no rate of its own, and its channels do not depend on it.
-    function = not is_file and _takes_commands(name)
+    function = twins.takes_commands(found)
     require(
         not function or (inputs and outputs),
         "--inputs, --outputs",
@@ -112,23 +113,12 @@ def log_case(
 def _object(name: str) -> Any:
     """What a name `module:object` stands for; None if there is none, which `get` refuses."""
     try:
-        return catalog.resolve(name)
+        return twins.made_by(catalog.resolve(name))
     except (ImportError, AttributeError, ValueError):
         return None
 
 
-def _is_case(name: str) -> bool:
+def _is_case(found: Any) -> bool:
     from retwin.cases.case import Case  # which needs torch
 
-    found = _object(name)
-    if callable(found) and not isinstance(found, Twin) and not _takes_commands(name):
-        found = found()
     return isinstance(found, Case)
-
-
-def _takes_commands(name: str) -> bool:
-    """Whether a name stands for a function of commands, which no twin is."""
-    found = _object(name)
-    if not callable(found) or (isinstance(found, Twin) and not isinstance(found, type)):
-        return False
-    return not twins.needs_no_arguments(found)

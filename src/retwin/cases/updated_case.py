@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import textwrap
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,8 @@ def updated_case(
     made = Environment(
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
-    made.filters |= {"toml": toml_text, "comment": _comment}
+    lines = partial(textwrap.fill, width=98, initial_indent="# ", subsequent_indent="# ")
+    made.filters |= {"toml": toml_text, "comment": lambda text: f"{lines(text)}\n"}
     template = resources.files(__package__).joinpath("updated.toml.j2").read_text("utf-8")
     values = zip(twin.parameters, twin.values, strict=True)
     return made.from_string(template).render(
@@ -107,11 +109,6 @@ def _describe_motion(measured: Trajectories) -> str:
         return "all the time"
     ramps = (segments.settle - segments.start)[segments.valid]
     return "in ramps" if np.median(ramps) > STEP else "in steps"
-
-
-def _comment(text: str) -> str:
-    lines = textwrap.wrap(text, 98, initial_indent="# ", subsequent_indent="# ")
-    return "\n".join([*lines, ""])
 
 
 def _channels(twin: ParametricTwin) -> dict[str, tuple[str, ...]]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from retwin import twins
 from retwin.catalog import CASES, TWINS
+from retwin.catalog.modules import known
 from retwin.checks import agree, given, require
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_faults, complete_twins
@@ -37,7 +38,6 @@ from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, example, table
 from retwin.data.io import check_target
 from retwin.errors import InputError
-from retwin.modules import known
 from retwin.serialisation.files import recover
 from retwin.serialisation.models import kind_of
 from retwin.times import to_samples

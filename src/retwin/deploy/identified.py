@@ -88,15 +88,9 @@ def save_identification(
     start = start_values(found.twin)
     with write_atomically(folder, folder=True) as part:
         save(logs.trajectories, part / "logs.npz")
-        text = updated_case(
-            opened,
-            found.twin,
-            part,
-            "logs.npz",
-            logs.trajectories,
-            spread_of(found.parameters),
-            logs.columns,
-        )
+        spread = spread_of(found.parameters)
+        measured = ("logs.npz", logs.trajectories, spread, logs.columns)
+        text = updated_case(opened, found.twin, part, *measured)
         (part / "updated.toml").write_text(text, encoding="utf-8")
         values["updated_case"] = _refused(part / "updated.toml", found.twin)
         if values["updated_case"]:
@@ -104,9 +98,8 @@ def save_identification(
         if start:
             _write_json(part / "start_values.json", start)
         _write_json(part / "identification.json", values)
-        page = identification_page(
-            found, values, start, checked, command=command, folder=str(folder)
-        )
+        about = {"command": command, "folder": str(folder)}
+        page = identification_page(found, values, start, checked, **about)
         (part / "report.html").write_text(page, encoding="utf-8", newline="\n")
         names = sorted(each.name for each in part.iterdir())
     return {**values, "files": {name: str(Path(folder) / name) for name in names}}
@@ -181,12 +174,8 @@ def _refused(path: Path, twin: ParametricTwin) -> str:
 
 def _correlations(names: Sequence[str], matrix: Any) -> list[list[Any]]:
     """Pairs of parameters with their correlation, the strongest first."""
-    pairs = [
-        [names[i], names[j], float(matrix[i, j])]
-        for i in range(len(names))
-        for j in range(i)
-        if np.isfinite(matrix[i, j])
-    ]
+    places = ((i, j) for i in range(len(names)) for j in range(i) if np.isfinite(matrix[i, j]))
+    pairs = [[names[i], names[j], float(matrix[i, j])] for i, j in places]
     return sorted(pairs, key=lambda each: -abs(each[2]))
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.catalog import METRICS, SOURCES, metrics_with
+from retwin.results.sources import Comparison
 from retwin.scores.bootstrap import MIN_RECORDS
 from retwin.scores.comparison import MIN_RUNS
-from retwin.source_results import Comparison
 
 MANY = 5
 """Number of sources beyond which figures and tables show a selection."""
@@ -28,7 +28,7 @@ NO_VERDICT = {
     None: "these results come from a version whose intervals do not contain the runs; "
     "run `retwin study` with this folder as --out again",
 }
-"""Why a pair has no verdict, by `retwin.source_results.Comparison.no_verdict`."""
+"""Why a pair has no verdict, by `retwin.results.sources.Comparison.no_verdict`."""
 REAL_DATA = {
     "none": "none",
     "timing": "timing of commands",

@@ -16,9 +16,9 @@ from retwin.data.trajectories import HEALTHY
 from retwin.errors import InputError
 from retwin.report.labels import order, quantities
 from retwin.results import FidelityResults, Results, read_results
+from retwin.results.sources import SourceResults
 from retwin.scores.decisions import Decision, decide
 from retwin.scores.uses import uses_of
-from retwin.source_results import SourceResults
 
 AGAIN = "run `retwin study` with this folder as --out again"
 BANDS = ("nominal", "observed", "seen", "quantiles", "ids", "rate")

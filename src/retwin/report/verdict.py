@@ -13,8 +13,8 @@ from retwin.catalog import METRICS
 from retwin.report.labels import MAIN, order, with_role
 from retwin.report.study import Study
 from retwin.results import Results
+from retwin.results.sources import Comparison
 from retwin.scores.comparison import alike, outcome
-from retwin.source_results import Comparison
 
 
 def outcome_of(comparison: Comparison) -> str:

@@ -19,12 +19,12 @@ from retwin.data.quality.check import Checked
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.fidelity import Fidelity, Overlay
 from retwin.results import SCHEMA, Results
+from retwin.results.sources import CurvePoint, SourceResults
 from retwin.scores.bootstrap import Draws
 from retwin.scores.comparison import MIN_RUNS, compare_runs, holm, no_verdict
 from retwin.scores.uses import uses_of
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import read_about
-from retwin.source_results import CurvePoint, SourceResults
 from retwin.study.answers import Answers, answers
 from retwin.study.files import Job
 from retwin.study.work import Work

@@ -138,11 +138,9 @@ def _from_module(
         found = resolve(TWINS[name].target if name in TWINS else name)
     except (ImportError, AttributeError, ValueError) as error:
         raise _unknown(name, str(error)) from None
-    # A class of twins satisfies the protocol too, although it is not a twin itself.
-    if isinstance(found, type) or not isinstance(found, Twin):
-        if callable(found) and not needs_no_arguments(found):
-            return _of_function(name, found, inputs, outputs, rate)
-        found = found() if callable(found) else found
+    found = made_by(found)
+    if takes_commands(found):
+        return _of_function(name, found, inputs, outputs, rate)
     if not isinstance(found, Twin):
         raise _unknown(name, f"a {type(found).__name__}")
     require(
@@ -195,13 +193,25 @@ def _check_one_array(name: str, function: Callable[..., Any], inputs: Sequence[s
         return
 
 
-def needs_no_arguments(function: Callable[..., Any]) -> bool:
-    """Whether it can be called without arguments: then it makes a twin."""
+def made_by(found: Any) -> Any:
+    """What a function or a class makes that can be called without arguments; else the object."""
     try:
-        inspect.signature(function).bind()
-    except (TypeError, ValueError):  # arguments are missing, or it has no signature
-        return False
-    return True
+        inspect.signature(found).bind()
+    except (TypeError, ValueError):  # it cannot be called, arguments are missing, or unknown
+        return found
+    return found() if _is_function(found) else found
+
+
+def takes_commands(found: Any) -> bool:
+    """Whether an object that `made_by` gave is a function of commands, which no twin is."""
+    return callable(found) and _is_function(found)
+
+
+def _is_function(found: Any) -> bool:
+    # A class of twins satisfies the protocol too, although it is not a twin itself.
+    from retwin.twins.twin import Twin
+
+    return isinstance(found, type) or not isinstance(found, Twin)
 
 
 def _unknown(name: str, got: str) -> InputError:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,20 +36,22 @@ class SimulationError(RuntimeError):
         return SimulationError, (self.failed, self.finished)
 
 
-@dataclass(frozen=True, eq=False)
 class Collected:
     """The outputs of all trajectories, and which of them failed or ended early.
 
     Chunks may be put from several threads at a time.
 
-    Attributes
+    Parameters
     ----------
     commands : ndarray, shape (n, T, d_u)
         The clean commands.
-    outputs : Channels
-        The output channels.
+    inputs, outputs : Channels
+        Their channels, and those of the outputs.
     rate : float
         Sample rate in Hz.
+
+    Attributes
+    ----------
     nominal, observed : ndarray, shape (n, T, d_y)
         The outputs of the chunks so far, in the precision of the commands.
     known : ndarray of int, shape (n)
@@ -60,20 +61,12 @@ class Collected:
 
     """
 
-    commands: NDArray
-    outputs: Channels
-    rate: float
-    nominal: NDArray
-    observed: NDArray
-    known: NDArray
-    reasons: dict[int, str] = field(default_factory=dict)
-
-    @classmethod
-    def empty(cls, commands: NDArray, outputs: Channels, rate: float) -> Collected:
-        """Before the first chunk."""
-        nominal = np.empty((*commands.shape[:2], len(outputs)), dtype=commands.dtype)
-        known = np.full(len(commands), commands.shape[1])
-        return cls(commands, outputs, rate, nominal, np.empty_like(nominal), known)
+    def __init__(self, commands: NDArray, inputs: Channels, outputs: Channels, rate: float) -> None:
+        self.commands, self.inputs, self.outputs, self.rate = commands, inputs, outputs, rate
+        self.nominal = np.empty((*commands.shape[:2], len(outputs)), dtype=commands.dtype)
+        self.observed = np.empty_like(self.nominal)
+        self.known = np.full(len(commands), commands.shape[1])
+        self.reasons: dict[int, str] = {}
 
     def put(
         self,
@@ -90,9 +83,7 @@ class Collected:
         for i, samples in known.items():
             self.known[index.start + i] = samples
 
-    def trajectories(
-        self, labels: NDArray, inputs: Channels, *, source: str, emulated: bool
-    ) -> Trajectories:
+    def trajectories(self, labels: NDArray, *, source: str, emulated: bool) -> Trajectories:
         """All of them; `source` describes where they come from.
 
         Raises
@@ -103,17 +94,21 @@ class Collected:
         """
         every = np.arange(len(self.commands))
         good = np.setdiff1d(every, list(self.reasons)) if self.reasons else slice(None)
-        observed = self.observed[good]
+        commands, observed = self.commands[good], self.observed[good]
+        # A copy if the caller may change its own array afterwards.
+        owner = commands if commands.base is None else commands.base
+        unchanged = not commands.flags.writeable and getattr(commands.base, "base", None) is None
+        owned = unchanged and not owner.flags.writeable
         mask = np.arange(observed.shape[1])[:, None] < self.known[good, None, None]
         made = Trajectories(
-            commands=_keep(self.commands[good]),
+            commands=commands if owned else commands.copy(),
             nominal=self.nominal[good],
             observed=observed,
             mask=np.broadcast_to(mask, observed.shape),
             ids=np.array([f"{i:05d}" for i in every], dtype=np.str_)[good],
             labels=labels[good],
             rate=self.rate,
-            inputs=inputs,
+            inputs=self.inputs,
             outputs=self.outputs,
             provenance=(Provenance(source),),
             emulated=emulated,
@@ -137,10 +132,3 @@ class Collected:
                     f"{sample / self.rate:g} s on"
                 )
         return reasons
-
-
-def _keep(commands: NDArray) -> NDArray:
-    """The commands, copied if the caller may change its own array afterwards."""
-    frozen = not commands.flags.writeable and getattr(commands.base, "base", None) is None
-    owner = commands if commands.base is None else commands.base
-    return commands if frozen and not owner.flags.writeable else commands.copy()

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import inspect
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import KW_ONLY, dataclass
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -146,16 +147,11 @@ class FunctionTwin:
             pool = cache(lambda: stack.enter_context(self._workers()) if self.workers > 1 else None)
 
             def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-                return self._run(pool(), chunk, seed, report)
+                return self._run(pool(), chunk, report)
 
+            size = TRAJECTORIES_PER_CHUNK
             return simulate_in_chunks(
-                self,
-                run,
-                commands,
-                faults,
-                seed=seed,
-                progress=progress,
-                size=TRAJECTORIES_PER_CHUNK,
+                self, run, commands, faults, seed=seed, progress=progress, size=size
             )
 
     def _workers(self) -> AbstractContextManager[ProcessPool]:
@@ -164,7 +160,7 @@ class FunctionTwin:
         return worker_processes(key, lambda: worker_pool(self.workers))
 
     def _run(
-        self, pool: ProcessPool | None, chunk: Chunk, seed: int, report: Callable
+        self, pool: ProcessPool | None, chunk: Chunk, report: Callable
     ) -> tuple[NDArray, NDArray]:
         """Nominal and observed outputs of a chunk."""
         held = chunk.held_commands
@@ -174,8 +170,8 @@ class FunctionTwin:
         if self.nominal is None:
             faulty = np.flatnonzero((held != chunk.commands).any(axis=(1, 2)))
         ideal = "function" if self.nominal is None else "nominal"
-        clean = self._calls(ideal, chunk, chunk.commands, every, seed)
-        calls = [*clean, *self._calls("function", chunk, held, faulty, seed)]
+        clean = self._calls(ideal, chunk, chunk.commands, every)
+        calls = [*clean, *self._calls("function", chunk, held, faulty)]
         outputs = []
         for output in _outputs(calls, pool, chunk):
             outputs.append(output)
@@ -186,63 +182,50 @@ class FunctionTwin:
             observed[faulty] = np.concatenate(outputs[len(clean) :])
         return nominal, observed
 
-    def _calls(
-        self, role: str, chunk: Chunk, commands: NDArray, rows: NDArray, seed: int
-    ) -> list[_Call]:
+    def _calls(self, role: str, chunk: Chunk, commands: NDArray, rows: NDArray) -> list[_Call]:
         """The calls that give the outputs of those rows of the chunk, in order."""
-        function = getattr(self, role)
-        random = role == "function" and _takes(function, "rng")
-        options = {"rate": self.rate} if _takes(function, "rate") else {}
         if len(rows) == 0:
             return []
         parts = [rows] if self.vectorised else np.split(rows, len(rows))
-        return [
-            _Call(
-                function=function,
-                role=role,
-                # A copy, which the function may change.
-                commands=commands[part],
-                outputs=self.outputs,
-                ids=part + chunk.index.start,
-                single=not self.vectorised,
-                seed=seed if random else None,
-                options=options,
-            )
-            for part in parts
-        ]
+        # Each has a copy of its commands, which the function may change.
+        return [_Call(self, role, commands[p], p + chunk.index.start, chunk.seed) for p in parts]
 
 
 @dataclass(frozen=True, eq=False)
 class _Call:
     """One call of a user's function, for one trajectory or for many."""
 
-    function: Function
+    twin: FunctionTwin
     role: str
     commands: NDArray
-    outputs: Channels
     ids: NDArray
-    single: bool
-    seed: int | None
-    options: Mapping[str, float]
+    seed: int
+
+    @property
+    def function(self) -> Function:
+        """The function that is called."""
+        return getattr(self.twin, self.role)
 
     def outputs_of(self) -> NDArray:
         """Call the function and check its outputs (n, T, d_y)."""
-        given = self.commands[0] if self.single else self.commands
-        if self.seed is None:
-            returned = self.function(given, **self.options)
-        else:
+        many = self.twin.vectorised
+        options: dict[str, Any] = {}
+        if _takes(self.function, "rate"):
+            options["rate"] = self.twin.rate
+        if self.role == "function" and _takes(self.function, "rng"):
             # With a spawn key, since the severities of faults are drawn from the seed itself.
             sequence = np.random.SeedSequence(self.seed, spawn_key=(int(self.ids[0]),))
-            rng = np.random.default_rng(sequence)
-            returned = self.function(given, rng=rng, **self.options)
+            options["rng"] = np.random.default_rng(sequence)
+        returned = self.function(self.commands if many else self.commands[0], **options)
         outputs = self._numbers(returned)
-        outputs = outputs[None] if self.single else outputs
+        outputs = outputs if many else outputs[None]
         self._check_finite(outputs)
         return outputs
 
     def _numbers(self, returned: ArrayLike) -> NDArray:
         """What the function returned, as numbers of the right shape."""
-        shape = (*self.commands.shape[:2], len(self.outputs))[int(self.single) :]
+        single, outputs = not self.twin.vectorised, self.twin.outputs
+        shape = (*self.commands.shape[:2], len(outputs))[int(single) :]
         try:
             # A copy: the function may reuse its own array.
             values = np.array(returned)
@@ -250,9 +233,9 @@ class _Call:
         except (TypeError, ValueError, RuntimeError) as error:
             values = np.empty(0)
             got = " ".join(str(error).split())
-        names = ", ".join(self.outputs.names)
+        names = ", ".join(outputs.names)
         other = "vectorised=False if it takes one trajectory, (T, d_u)"
-        if self.single:
+        if single:
             other = "vectorised=True if it takes many trajectories, (n, T, d_u)"
         require(
             values.shape == shape and values.dtype.kind in "fiub",
@@ -271,7 +254,7 @@ class _Call:
             raise InputError(
                 self.role,
                 expected=f"{_name(self.function)} to return finite numbers",
-                got=f"{outputs[row, sample, channel]} for {self.outputs.names[channel]} in "
+                got=f"{outputs[row, sample, channel]} for {self.twin.outputs.names[channel]} in "
                 f"trajectory {self.ids[row]}, sample {sample}",
                 remedy="repair the function, or give limits that exclude such commands",
             )
@@ -298,7 +281,7 @@ def _outputs(calls: Sequence[_Call], pool: ProcessPool | None, chunk: Chunk) -> 
             chunk.failed[int(call.ids[0]) - chunk.index.start] = (
                 f"the process of {_name(call.function)} died, exit code {error.exitcode}"
             )
-            yield np.zeros((*call.commands.shape[:2], len(call.outputs)))
+            yield np.zeros((*call.commands.shape[:2], len(call.twin.outputs)))
 
 
 def _in_worker(pickled: bytes, role: str) -> NDArray:

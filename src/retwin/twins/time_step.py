@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from math import inf
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -55,15 +54,8 @@ def steps_per_sample(rate: float, step: float) -> int:
 class Timed:
     """What has a sample rate in Hz and a duration in s, which are fields of the subclass."""
 
-    if TYPE_CHECKING:
-
-        @property
-        def rate(self) -> float:
-            """Sample rate in Hz."""
-
-        @property
-        def duration(self) -> float:
-            """Duration in s."""
+    rate: float
+    duration: float
 
     @property
     def steps(self) -> int:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -262,6 +262,10 @@ class Chunk:
         Segments of the clean commands.
     rate : float
         Sample rate in Hz.
+    seed : int
+        Seed of the whole simulation.
+    parameters : mapping of str to ndarray, shape (n,)
+        Values of parameters of the twin.
     failed : dict of int to str
         Filled in by the simulation: the trajectories of this chunk, counted from 0, that could
         not be simulated, and the reasons. Their outputs are ignored.
@@ -280,6 +284,8 @@ class Chunk:
     faults: Sequence[Fault | None]
     segments: Segments
     rate: float
+    seed: int = 0
+    parameters: Mapping[str, NDArray] = field(default_factory=dict)
     failed: dict[int, str] = field(default_factory=dict)
     known: dict[int, int] = field(default_factory=dict)
     turn: AbstractContextManager[None] = field(default_factory=nullcontext)
@@ -310,6 +316,7 @@ def simulate_in_chunks(
     size: int = 128,
     emulated: bool = False,
     threaded: bool = False,
+    parameters: Mapping[str, NDArray] | None = None,
 ) -> Trajectories:
     """Simulate by a function of chunks: the steps that the `simulate` of all twins shares.
 
@@ -331,6 +338,8 @@ def simulate_in_chunks(
         Whether the result stands in for measurements.
     threaded : bool, default False
         Whether `run` may be called in several threads at a time, and then uses `Chunk.turn`.
+    parameters : mapping of str to ndarray, shape (n,), optional
+        Values of parameters of the twin.
 
     Returns
     -------
@@ -353,22 +362,21 @@ def simulate_in_chunks(
     segments = Segments.from_commands(commands)
     faults = [None] * len(commands) if faults is None else faults
     drawn = draw_faults(faults, segments, seed, rate=twin.rate)
-    collected = Collected.empty(commands, twin.outputs, twin.rate)
+    collected = Collected(commands, twin.inputs, twin.outputs, twin.rate)
     turns = Turns()
 
     def run_chunk(begin: int) -> float:
-        index = slice(begin, begin + size)
-        own_commands, own_faults, own_segments = commands[index], drawn[index], segments[index]
-        effective = faulty_commands(own_commands, own_faults, own_segments, rate=twin.rate)
+        index, rate = slice(begin, begin + size), twin.rate
+        clean, own, parts = commands[index], drawn[index], segments[index]
+        effective = faulty_commands(clean, own, parts, rate=rate)
+        values = {name: each[index] for name, each in (parameters or {}).items()}
         turn = turns.turn(begin // size)
-        chunk = Chunk(
-            index, own_commands, effective, own_faults, own_segments, twin.rate, turn=turn
-        )
+        chunk = Chunk(index, clean, effective, own, parts, rate, seed, values, turn=turn)
         try:
             nominal, healthy = run(chunk)
         finally:
             turns.over(begin // size)
-        observed = measured_with(healthy, own_faults, twin.rate)
+        observed = measured_with(healthy, own, rate)
         collected.put(index, nominal, observed, chunk.failed, chunk.known)
         return min(1.0, (begin + size) / len(commands))
 
@@ -377,4 +385,26 @@ def simulate_in_chunks(
             progress(share)
     labels = np.array([HEALTHY if fault is None else fault.label for fault in drawn])
     source = f"{type(twin).__name__} seed={seed}"
-    return collected.trajectories(labels, twin.inputs, source=source, emulated=emulated)
+    return collected.trajectories(labels, source=source, emulated=emulated)
+
+
+class ChunkedTwin:
+    """The base of twins that simulate some trajectories at a time, by their method `_run`."""
+
+    _chunk: ClassVar[int] = 128
+    """Trajectories that are simulated together, at most."""
+
+    def simulate(
+        self,
+        commands: NDArray,
+        *,
+        faults: Sequence[Fault | None] | None = None,
+        seed: int,
+        progress: Progress | None = None,
+    ) -> Trajectories:
+        """See `Twin.simulate`."""
+        twin: Any = self  # with the channels and the rate of the subclass
+        how: Any = {"size": self._chunk, "emulated": getattr(self, "emulated", False)}
+        return simulate_in_chunks(
+            twin, twin._run, commands, faults, seed=seed, progress=progress, **how
+        )

@@ -15,9 +15,9 @@ from typing import Any, TypeAlias, TypeVar
 
 from pebble import ProcessExpired
 
+from retwin.catalog.modules import add_known, known
 from retwin.checks import needs_extra
 from retwin.errors import InputError
-from retwin.modules import add_known, known
 from retwin.progress import Progress
 from retwin.workers.pools import check_sendable, sendable_errors, worker_pool
 

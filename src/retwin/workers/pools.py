@@ -25,8 +25,8 @@ from typing import Any
 
 from pebble import ProcessPool
 
+from retwin.catalog.modules import add_known, known
 from retwin.errors import InputError, place_of
-from retwin.modules import add_known, known
 
 
 @contextmanager

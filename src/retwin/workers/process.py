@@ -27,7 +27,7 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.entries import resolve
+from retwin.catalog import resolve
 from retwin.errors import InputError, brief, rebuild
 
 HEAD = struct.Struct("<4sI")

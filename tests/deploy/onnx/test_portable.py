@@ -20,9 +20,10 @@ import retwin as rt
 from retwin.deploy.bundle.bundle import Bundle
 from retwin.deploy.bundle.seal import seal
 from retwin.deploy.onnx import session
-from retwin.deploy.onnx.export import PARITY, export_onnx
+from retwin.deploy.onnx.export import export_onnx
 from retwin.deploy.onnx.graphs import FeaturesGraph, SensorGraph
 from retwin.deploy.onnx.portable import Portable, settled_at
+from retwin.deploy.parity import PARITY
 from retwin.diagnosis.trained.features import SETTLED, Features
 from retwin.serialisation import sizes
 from retwin.update.corrected import CorrectedTwin

@@ -185,10 +185,7 @@ def _choose(trajectories: Trajectories, case: Case, index: int | str) -> Traject
     elif 0 <= index < len(ids):
         return trajectories[[index]]
     raise InputError(
-        "index",
-        expected=expected,
-        got=repr(index),
-        remedy="`retwin data info FILE` lists them",
+        "index", expected=expected, got=repr(index), remedy="`retwin data info FILE` lists them"
     )
 
 

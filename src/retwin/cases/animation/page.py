@@ -10,16 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.cases.animation.shots import (
-    GHOST,
-    PAPER,
-    RING,
-    SOLID,
-    UPDATED,
-    Camera,
-    Pictures,
-    Shots,
-)
+from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, UPDATED, Camera, Pictures, Shots
 
 DPI = 100
 """Pixels per inch, by which matplotlib converts sizes."""

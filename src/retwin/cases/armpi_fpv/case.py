@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.cases.armpi_fpv.body import ArmBody
-from retwin.cases.armpi_fpv.classes import BIASED, STUCK
 from retwin.cases.armpi_fpv.emulator import EmulatedArmPi
 from retwin.cases.armpi_fpv.parameters import armpi_parametric
-from retwin.cases.armpi_fpv.recorded import recover
+from retwin.cases.armpi_fpv.recorded import BIASED, STUCK, recover
 from retwin.cases.armpi_fpv.twin import (
     ARM,
     KINEMATIC,

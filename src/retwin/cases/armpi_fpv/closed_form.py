@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from numpy.typing import NDArray
 
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
-from retwin.data.trajectories import Channels, Trajectories
-from retwin.progress import Progress
-from retwin.twins.faults.actuator_faults import Fault
+from retwin.data.trajectories import Channels
 from retwin.twins.faults.applied_faults import frozen_response
 from retwin.twins.limits import Limits
-from retwin.twins.twin import Chunk, simulate_in_chunks
+from retwin.twins.twin import Chunk, ChunkedTwin
 
 
 @dataclass(frozen=True)
@@ -63,10 +60,11 @@ class ServoLag:
 
 
 @dataclass(frozen=True)
-class KinematicTwin:
+class KinematicTwin(ChunkedTwin):
     """An arm whose joints follow their commands with a lag.
 
-    The nominal output is the forward kinematics of the clean commands without lag.
+    The nominal output is the forward kinematics of the clean commands without lag. The lagged
+    response of a stuck actuator is held.
 
     Parameters
     ----------
@@ -143,17 +141,6 @@ class KinematicTwin:
 
         """
         return commands if self.lag is None else self.lag.respond(commands, self.rate)
-
-    def simulate(
-        self,
-        commands: NDArray,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int,
-        progress: Progress | None = None,
-    ) -> Trajectories:
-        """See `Twin.simulate`; the lagged response of a stuck actuator is held."""
-        return simulate_in_chunks(self, self._run, commands, faults, seed=seed, progress=progress)
 
     def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
         """Nominal and observed outputs of a chunk."""

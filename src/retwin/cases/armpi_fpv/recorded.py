@@ -6,12 +6,18 @@ import warnings
 
 import numpy as np
 
-from retwin.cases.armpi_fpv.classes import CLASSES
 from retwin.cases.armpi_fpv.recovery import recover_commands
 from retwin.cases.armpi_fpv.twin import ARM, KINEMATIC
 from retwin.cases.recorded import RecordedCase
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.progress import Progress
+
+STUCK = tuple(f"Motor_{i}_Stuck" for i in range(1, 5))
+"""Classes in which motor i stops moving."""
+BIASED = tuple(f"Motor_{i}_Steady_state_error" for i in range(1, 5))
+"""Classes in which motor i settles at a biased target: the paper's steady-state error (SSE)."""
+CLASSES = (HEALTHY, *STUCK, *BIASED)
+"""All classes in the order of probabilities and of confusion matrices."""
 
 
 def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:

@@ -21,7 +21,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from retwin.data.trajectories import Channels
+from retwin.cases.recorded import RecordedCase
+from retwin.data.trajectories import HEALTHY, Channels
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.limits import Limits
@@ -114,3 +115,6 @@ OVERFLOWING_TANKS = StateTwin(
 """The complete physics, before its identification: also the level at which the upper tank
 overflows, the fraction of this that falls into the lower tank, and the exponents of both
 outflows."""
+
+RECORDED = RecordedCase((HEALTHY,), TANKS)
+"""What files of the tanks' trajectories need of their case."""

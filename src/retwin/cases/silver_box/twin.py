@@ -16,7 +16,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from retwin.data.trajectories import Channels
+from retwin.cases.recorded import RecordedCase
+from retwin.data.trajectories import HEALTHY, Channels
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import Parameter
@@ -51,3 +52,6 @@ SILVERBOX = StateTwin(
     substeps=2,
 )
 """The linear twin, fitted by least squares to realisations 1 to 9; all parameters can be freed."""
+
+RECORDED = RecordedCase((HEALTHY,), SILVERBOX)
+"""What files of the Silverbox's trajectories need of their case."""

@@ -17,7 +17,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from retwin.data.trajectories import Channels
+from retwin.cases.recorded import RecordedCase
+from retwin.data.trajectories import HEALTHY, Channels
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.limits import Limits
@@ -55,3 +56,6 @@ INCUBATOR = StateTwin(
 """The twin, fitted by least squares to the record of 2020-09-18. A switch that is on for a part of
 a sample is that share of the heater's power. At the first sample the heater is up to 50 K warmer
 than the air, and the fit ends there."""
+
+RECORDED = RecordedCase((HEALTHY,), INCUBATOR)
+"""What files of the incubator's trajectories need of their case."""

@@ -15,10 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.checks import positive, require, whole
+from retwin.checks import positive, whole
 from retwin.data.trajectories import Channels
 from retwin.deploy.actuator.draws import Draws, causal_part, drawn, still_and_fastest
 from retwin.deploy.actuator.module import AT_REST, Actuators, ActuatorStep
+from retwin.deploy.parity import check_parity
 from retwin.serialisation.models import write_model
 from retwin.serialisation.places import check_place
 from retwin.twins.twin import checked_commands, checked_seed
@@ -26,28 +27,15 @@ from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import DelayOffset
 from retwin.update.surrogate import Surrogate
 
-PARITY = 1e-5
-"""Greatest difference between a written file and torch, relative to the range of each output."""
 MAX_DRAWS = 10_000_000
 """Draws of z at most: more would not fit in memory beside a simulation."""
 DATE = (1980, 1, 1, 0, 0, 0)
 """The date of the parts of a file: the same twin gives the same bytes."""
 EXAMPLES, STEPS = 3, 40
 """Environments and steps with which written files are compared with torch."""
-INPUTS = (
-    "command",
-    "uniform",
-    "delay",
-    "offset",
-    "probability",
-    "previous",
-    "reference",
-    "resting",
-    "missed",
-    "history",
-)
-"""Inputs of the ONNX graph, the state last."""
-STATE = INPUTS[5:]
+DRAWN = ("delay", "offset", "probability")
+STATE = ("previous", "reference", "resting", "missed", "history")
+"""Inputs of the ONNX graph, after the command and its noise: what is drawn, and the state."""
 
 
 @dataclass(frozen=True)
@@ -157,10 +145,18 @@ def export_actuator(
         "emulated": twin.residual.emulated,
     }
     table = {name: getattr(actuators, name) for name in ("delays", "offsets", "probabilities")}
-    with write_model(folder, "actuator", about, table) as inside:
-        _write_script(actuators, inside / "actuator.pt", given)
+    with write_model(folder, "actuator", about, table) as inside, torch.no_grad():
+        examples = _examples(actuators, given)
+        executed = {
+            "TorchScript": _execute(write_script(actuators, inside / "actuator.pt"), examples)
+        }
         if onnx:
-            _write_onnx(actuators, inside / "actuator.onnx", given)
+            graph = _run_graph(actuators, inside / "actuator.onnx", examples)
+            executed["an ONNX graph"] = graph
+        expected = _execute(actuators, examples)
+        extent = (expected.amax(dim=(0, 1)) - expected.amin(dim=(0, 1))).clamp_min(1e-30)
+        for what, made in executed.items():
+            check_parity("twin", what, made, expected, extent)
     return ExportedActuator(
         Path(folder),
         tuple(files),
@@ -185,10 +181,7 @@ def _actuators(
         plant = ScriptedNetwork(twin.surrogate)
     step = ActuatorStep(
         plant,
-        gain=found.gain,
-        centre=found.centre,
-        low=found.low,
-        high=found.high,
+        found,
         tolerance=torch.as_tensor(still, dtype=torch.float32),
         speed=torch.as_tensor(change * twin.rate * period, dtype=torch.float32),
         # A motion of the twin ends when a sample equals the one before.
@@ -196,7 +189,7 @@ def _actuators(
     )
     delay = found.delay / period
     length = math.floor(float(delay.max())) + 2
-    return Actuators(step, delay, found.offset, found.probability, length).eval()
+    return Actuators(step, delay, found, length).eval()
 
 
 class ScriptedNetwork(nn.Module):
@@ -223,80 +216,49 @@ def _examples(actuators: Actuators, commands: NDArray) -> tuple[Tensor, Tensor, 
     return rows, sent, torch.rand(sent.shape, generator=generator)
 
 
-def _expected(actuators: Actuators, commands: NDArray) -> Tensor:
-    """What the module executes for the examples, (STEPS, EXAMPLES, d_y)."""
-    rows, sent, uniform = _examples(actuators, commands)
+def _execute(actuators: Any, examples: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """What actuators execute for the examples, (STEPS, EXAMPLES, d_y); none are left in it."""
+    rows, sent, uniform = examples
     actuators.start(sent[0], rows)
     made = torch.stack([actuators(u, noise) for u, noise in zip(sent, uniform, strict=True)])
     actuators.start(sent[0, :0], rows[:0])
     return made
 
 
-def _check(what: str, found: Tensor, expected: Tensor) -> None:
-    extent = (expected.amax(dim=(0, 1)) - expected.amin(dim=(0, 1))).clamp_min(1e-30)
-    error = float(((found - expected).abs() / extent).max())
-    require(
-        error <= PARITY,
-        "twin",
-        expected=f"{what} that agrees with torch to {PARITY:g}",
-        got=f"a difference of {error:.2g}",
-        remedy="report this: the file is wrong",
-    )
-
-
-@torch.no_grad()
-def _write_script(actuators: Actuators, path: Path, commands: NDArray) -> None:
-    """The TorchScript file, read again and compared."""
-    expected = _expected(actuators, commands)
-    again = write_script(actuators, path)
-    rows, sent, uniform = _examples(actuators, commands)
-    again.start(sent[0], rows)
-    found = [again(u, noise) for u, noise in zip(sent, uniform, strict=True)]
-    _check("TorchScript", torch.stack(found), expected)
-
-
 def write_script(module: nn.Module, path: Path) -> Any:
-    """Write a module as TorchScript, and read it again."""
+    """Write a module as TorchScript, without the names of source files, and read it again."""
     with warnings.catch_warnings():
         # Isaac Lab and mjlab read TorchScript, which torch calls deprecated.
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.jit.save(torch.jit.script(module), str(path))
-        _without_sources(path)
+        with zipfile.ZipFile(path) as archive:
+            parts = {name: archive.read(name) for name in archive.namelist()}
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in parts.items():
+                if not name.endswith(".debug_pkl"):
+                    archive.writestr(zipfile.ZipInfo(name, DATE), data)
         return torch.jit.load(str(path))
 
 
-def _without_sources(path: Path) -> None:
-    """Leave out the names of source files, which torch writes for its messages."""
-    with zipfile.ZipFile(path) as archive:
-        kept = [(each, archive.read(each)) for each in archive.infolist()]
-    with zipfile.ZipFile(path, "w") as archive:
-        for each, data in kept:
-            if not each.filename.endswith(".debug_pkl"):
-                archive.writestr(zipfile.ZipInfo(each.filename, DATE), data)
-
-
-@torch.no_grad()
-def _write_onnx(actuators: Actuators, path: Path, commands: NDArray) -> None:
-    """The ONNX graph of one step, run by onnxruntime and compared."""
+def _run_graph(actuators: Actuators, path: Path, examples: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """Write the ONNX graph of one step; what onnxruntime executes for the examples."""
     import onnxruntime
 
     from retwin.deploy.onnx.export import write_graph
 
-    expected = _expected(actuators, commands)
-    rows, sent, uniform = _examples(actuators, commands)
+    rows, sent, uniform = examples
     actuators.start(sent[0], rows)
-    held = {name: getattr(actuators, name) for name in INPUTS[2:]}
+    held = {name: getattr(actuators, name) for name in (*DRAWN, *STATE)}
     inputs = {"command": sent[0], "uniform": uniform[0], **held}
     batch = {name: 1 if name == "history" else 0 for name in inputs}
     outputs = ("executed", *(f"next_{name}" for name in STATE))
     write_graph(actuators.step, inputs, path, outputs=outputs, batch=batch)
-    actuators.start(sent[0, :0], rows[:0])
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     values = {name: each.numpy() for name, each in inputs.items()}
-    found = []
+    made = []
     for u, noise in zip(sent, uniform, strict=True):
         values |= {"command": u.numpy(), "uniform": noise.numpy()}
         executed, *state = session.run(None, values)
         values |= dict(zip(STATE, state, strict=True))
-        found.append(torch.as_tensor(executed))
-    _check("an ONNX graph", torch.stack(found), expected)
+        made.append(torch.as_tensor(executed))
+    return torch.stack(made)

@@ -12,6 +12,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from retwin.deploy.actuator.draws import Draws
+
 AT_REST = 1e6
 """Steps at rest with which an episode begins: more than any number of steps that counts as rest."""
 
@@ -23,9 +25,9 @@ class ActuatorStep(nn.Module):
     ----------
     plant : nn.Module
         Commands (n, d_u) to undelayed outputs (n, d_y): the identity, or a network without memory.
-    gain, centre, low, high : Tensor
-        (d_y,), the error in proportion to the distance of the output from `centre`, within the
-        range from `low` to `high`, in which the gain was estimated.
+    found : Draws
+        Its gain is the error in proportion to the distance of the output from `centre`, within the
+        range from `low` to `high`, in which it was estimated.
     tolerance : Tensor
         (d_u,), the largest change of a command that counts as none.
     speed : Tensor
@@ -36,24 +38,15 @@ class ActuatorStep(nn.Module):
     """
 
     def __init__(
-        self,
-        plant: nn.Module,
-        *,
-        gain: Tensor,
-        centre: Tensor,
-        low: Tensor,
-        high: Tensor,
-        tolerance: Tensor,
-        speed: Tensor,
-        rest: float,
+        self, plant: nn.Module, found: Draws, *, tolerance: Tensor, speed: Tensor, rest: float
     ) -> None:
         super().__init__()
         self.plant = plant
         self.rest = rest
-        self.gain = nn.Buffer(gain)
-        self.centre = nn.Buffer(centre)
-        self.low = nn.Buffer(low)
-        self.high = nn.Buffer(high)
+        self.gain = nn.Buffer(found.gain)
+        self.centre = nn.Buffer(found.centre)
+        self.low = nn.Buffer(found.low)
+        self.high = nn.Buffer(found.high)
         self.tolerance = nn.Buffer(tolerance)
         self.speed = nn.Buffer(speed)
 
@@ -134,22 +127,18 @@ class Actuators(nn.Module):
     ----------
     step : ActuatorStep
         One step.
-    delays, offsets, probabilities : Tensor
-        (K, 1), (K, d_y) and (K, d_u), the draws of z.
+    delays : Tensor
+        (K, 1), the delays of the draws of z, in steps.
+    found : Draws
+        The draws of z.
     length : int
         Steps in the history, L.
 
     """
 
-    def __init__(
-        self,
-        step: ActuatorStep,
-        delays: Tensor,
-        offsets: Tensor,
-        probabilities: Tensor,
-        length: int,
-    ) -> None:
+    def __init__(self, step: ActuatorStep, delays: Tensor, found: Draws, length: int) -> None:
         super().__init__()
+        offsets, probabilities = found.offset, found.probability
         self.step = step
         self.length = length
         self.at_rest = AT_REST

@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from retwin.checks import finite, require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.deploy.actuator.export import PARITY, ScriptedNetwork, write_script
+from retwin.deploy.actuator.export import ScriptedNetwork, write_script
+from retwin.deploy.parity import check_parity
 from retwin.nets.networks import MLP
 from retwin.nets.training import Training
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place
 from retwin.twins.twin import Twin, checked_commands, checked_seed
-from retwin.update.surrogate import Surrogate, fit_surrogate
+from retwin.update.surrogate import fit_surrogate
 
 MAX_HISTORY = 1000
 """Steps into the past at most."""
@@ -151,7 +151,13 @@ def export_actuator_net(
         simulated, MLP((32, 32)), seed=seed, training=training, progress=progress
     )
     assert network.fitted is not None
-    _write(network, path, torch.as_tensor(inputs.reshape(-1, inputs.shape[2])))
+    module = ScriptedNetwork(network).eval()
+    with write_atomically(path) as temporary, torch.no_grad():
+        again: Any = write_script(module, Path(temporary))
+        given = torch.as_tensor(inputs.reshape(-1, inputs.shape[2]))[:1000]
+        expected = module(given)
+        extent = float(expected.max() - expected.min()) or 1.0
+        check_parity("twin", "TorchScript", again(given), expected, extent)
     error = float(network.fitted.figures["nrmse_torque"])
     return ExportedActuatorNet(path, lags, 1 / twin.rate, units.pop(), error)
 
@@ -215,14 +221,3 @@ def _examples(
             columns.append(past)
     inputs = np.stack(columns, axis=-1).astype(np.float32)
     return inputs, made.observed[..., [torque]].astype(np.float32)
-
-
-def _write(network: Surrogate, path: Path, inputs: Tensor) -> None:
-    """The network with its scales inside, read again and compared."""
-    module = ScriptedNetwork(network).eval()
-    with write_atomically(path) as temporary:
-        again: Any = write_script(module, Path(temporary))
-        expected, found = module(inputs[:1000]), again(inputs[:1000])
-        extent = float(expected.max() - expected.min()) or 1.0
-        right = float((found - expected).abs().max()) <= PARITY * extent
-        _require(right, "twin", "TorchScript that agrees with torch", "another", "report this")

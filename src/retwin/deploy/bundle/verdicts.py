@@ -176,10 +176,7 @@ class Domain:
             remedy="make the bundle and its export anew",
         )
         with np.errstate(over="ignore", invalid="ignore"):
-            widths = [
-                np.subtract(self.high, self.low),
-                np.subtract(self.ceiling, self.floor),
-            ]
+            widths = [np.subtract(self.high, self.low), np.subtract(self.ceiling, self.floor)]
         numbers = [getattr(self, each.name) for each in fields(self)]
         sizes = [*widths, self.speed, self.spread, self.mismatch]
         require(
@@ -215,7 +212,7 @@ class Domain:
             speed=floats(np.max([each.max(axis=(0, 1)) for each in speeds], axis=0)),
             floor=floats(np.ma.min(floors, axis=0).filled(0.0)),
             ceiling=floats(np.ma.max(ceilings, axis=0).filled(0.0)),
-            spread=floats(_nonzero(spread)),
+            spread=floats(np.where(spread > 0, spread, 1.0)),  # 1 where an output never varies
         )
 
     def differences(self, nominal: NDArray, predicted: NDArray) -> NDArray:
@@ -335,8 +332,3 @@ def _excess(values: NDArray, low: Any, high: Any, mask: NDArray | None = None) -
         values = np.where(mask, values, low)
     least, greatest, _ = extremes(values)
     return excess(least, greatest, low, high).max(axis=1)
-
-
-def _nonzero(sizes: NDArray) -> NDArray:
-    """The sizes, 1 for a channel that never varies."""
-    return np.where(sizes > 0, sizes, 1.0)

@@ -82,10 +82,8 @@ def variables_of(
     quantities = (("mean", "its mean"), ("q05", "its 5 % quantile"), ("q95", "its 95 % quantile"))
     for suffix, about in quantities:
         made += [Variable(f"{name}.{suffix}", unit, about, "output") for name, unit in ys]
-    gain, bias = (
-        "fault: relative change of the command's effect",
-        "fault: added to what is measured",
-    )
+    gain = "fault: relative change of the command's effect"
+    bias = "fault: added to what is measured"
     made += [Variable(f"fault.gain.{name}", "", gain, "parameter") for name, _ in us]
     made += [Variable(f"fault.bias.{name}", unit, bias, "parameter") for name, unit in ys]
     made += [
@@ -124,6 +122,7 @@ def _printable(text: str) -> str:
 
 
 CAUSALITY = {
+    "time": ("independent", "continuous"),
     "input": ("input", "continuous"),
     "output": ("output", "continuous"),
     "parameter": ("parameter", "tunable"),
@@ -181,33 +180,27 @@ def description(
             "variableNamingConvention": "flat",
         },
     )
-    able = ("canGetAndSetFMUstate", "canSerializeFMUstate")
-    able = able if two else ("canGetAndSetFMUState", "canSerializeFMUState")
+    able = [f"{verb}FMU{'state' if two else 'State'}" for verb in ("canGetAndSet", "canSerialize")]
     facts = dict.fromkeys((*able, "canHandleVariableCommunicationStepSize"), "true")
     inside = SubElement(root, "CoSimulation", {"modelIdentifier": identifier, **facts})
     if two:
         SubElement(SubElement(inside, "SourceFiles"), "File", {"name": f"{identifier}.c"})
     units = sorted({each.unit for each in variables if each.unit})
-    if units:
-        definitions = SubElement(root, "UnitDefinitions")
-        for unit in units:
-            SubElement(definitions, "Unit", {"name": unit})
+    definitions = SubElement(root, "UnitDefinitions") if units else root
+    for unit in units:
+        SubElement(definitions, "Unit", {"name": unit})
     SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(period)})
     listed = SubElement(root, "ModelVariables")
     shown = [(i, each) for i, each in enumerate(variables) if not (two and each.role == "time")]
     for reference, each in shown:
         _add_variable(listed, reference, each, two=two)
     structure = SubElement(root, "ModelStructure")
-    outputs = [
-        (place if two else reference)
-        for place, (reference, each) in enumerate(shown, 1)
-        if each.role in OUTPUTS
-    ]
+    outputs = [i for i, (_, each) in enumerate(shown) if each.role in OUTPUTS]
     for tag in ("Output", "InitialUnknown"):
         held = SubElement(structure, f"{tag}s") if two else structure
-        for place in outputs:
-            reference_to = {"index" if two else "valueReference": str(place)}
-            SubElement(held, "Unknown" if two else tag, reference_to)
+        for i in outputs:
+            place = {"index": str(i + 1)} if two else {"valueReference": str(shown[i][0])}
+            SubElement(held, "Unknown" if two else tag, place)
     return _written(root)
 
 
@@ -219,32 +212,23 @@ def _add_variable(listed: Element, reference: int, each: Variable, *, two: bool)
     if each.about:
         common["description"] = each.about
     values = {"unit": each.unit} if each.unit else {}
+    common |= dict(zip(("causality", "variability"), CAUSALITY[each.role], strict=True))
     if each.role == "time":
-        SubElement(
-            listed, kind, {**common, "causality": "independent", "variability": "continuous"}
-        )
-        return
-    causality, variability = CAUSALITY[each.role]
-    common |= {"causality": causality, "variability": variability}
-    if each.role in OUTPUTS:
+        values = {}
+    elif each.role in OUTPUTS:
         common["initial"] = "calculated"
     else:
         starts = {"seed": "0", "noise": "false"}
         values["start"] = starts.get(each.role, repr(float(each.start)))
-    values |= _range(each)
+    if each.limits is not None:
+        low, high = map(float, each.limits)
+        largest = max(abs(low), abs(high))
+        values |= {"min": repr(low), "max": repr(high)}
+        values |= {"nominal": repr(largest)} if largest > 0 else {}
     if two:
         SubElement(SubElement(listed, "ScalarVariable", common), kind, values)
     else:
         SubElement(listed, kind, {**common, **values})
-
-
-def _range(each: Variable) -> dict[str, str]:
-    """The attributes of a variable with limits; its nominal value is the greatest magnitude."""
-    if each.limits is None:
-        return {}
-    low, high = map(float, each.limits)
-    found = {"min": low, "max": high, "nominal": max(abs(low), abs(high))}
-    return {name: repr(value) for name, value in found.items() if name != "nominal" or value > 0}
 
 
 def build_description(identifier: str) -> bytes:

@@ -6,19 +6,19 @@ import os
 import re
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from numpy.typing import NDArray
 
-from retwin.checks import ends_in, needs_extra, one_of
-from retwin.compiler import build, c_source, compilers
+from retwin.checks import ends_in, given, needs_extra, one_of
+from retwin.compiler import build, c_source, try_compilers
 from retwin.deploy.fmu.description import build_description, description, token_of
 from retwin.deploy.fmu.states import states_text
 from retwin.deploy.fmu.surrogates import surrogate_text
 from retwin.deploy.fmu.text import Text
-from retwin.errors import InputError, brief
+from retwin.errors import InputError
 from retwin.serialisation.files import write_atomically
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.corrected import CorrectedTwin
@@ -120,23 +120,18 @@ def export_fmu(
     head = f'#include "{fmi}Functions.h"\n#define TOKEN "{token}"\ntypedef {fmi}Boolean Boolean;'
     source = "\n".join([text.source, head, c_source(__package__, "interface.c", f"{fmi}.c")])
     headers = Path(str(fmpy.__file__)).parent / "c-code"
+    # A twin knows its case by the path of its file, which concerns nobody else.
+    about = Path(text.about).stem if os.path.isabs(text.about) else text.about or path.stem
+    described = description(version, identifier, token, about, text.variables, 1 / text.rate)
     content: dict[str, bytes] = {
-        "modelDescription.xml": description(
-            version,
-            identifier,
-            token,
-            # A twin knows its case by the path of its file, which concerns nobody else.
-            Path(text.about).stem if os.path.isabs(text.about) else text.about or path.stem,
-            text.variables,
-            1 / text.rate,
-        ),
+        "modelDescription.xml": described,
         f"sources/{identifier}.c": source.encode(),
         **{f"sources/{name}": (headers / name).read_bytes() for name in HEADERS[version]},
     }
     if version == "3.0":
         content["sources/buildDescription.xml"] = build_description(identifier)
     if compiled:
-        content[_binary(version, identifier)] = _compiled(content, identifier)
+        _add_binary(content, version, identifier)
     with write_atomically(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, data in content.items():
             entry = zipfile.ZipInfo(name, DATE)
@@ -162,32 +157,23 @@ def _text(twin: object, commands: NDArray | None) -> Text:
     )
 
 
-def _binary(version: str, identifier: str) -> str:
-    """Where the binary of this machine belongs."""
+def _add_binary(content: dict[str, bytes], version: str, identifier: str) -> None:
+    """Compile the source code for this machine, and add the binary where it belongs."""
     from fmpy import platform, platform_tuple, sharedLibraryExtension
 
-    folder = platform if version == "2.0" else platform_tuple
-    return f"binaries/{folder}/{identifier}{sharedLibraryExtension}"
-
-
-def _compiled(content: Mapping[str, bytes], identifier: str) -> bytes:
-    """The binary of the source code."""
-    reasons = []
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         for name, data in content.items():
             file = Path(folder, name)
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(data)
         source, library = Path(folder, "sources", f"{identifier}.c"), Path(folder, "library")
-        for command in compilers():
-            try:
-                build((*command, *FLAGS), source, library)
-                return library.read_bytes()
-            except OSError as error:
-                reasons.append(f"{command[0]}: {brief(error)}")
-    raise InputError(
-        "compiled",
-        expected="a C compiler",
-        got="; ".join(reasons) or "none that is installed",
-        remedy="install one, or retwin[compiled], or give compiled=False",
-    )
+
+        def compile_with(command: Sequence[str]) -> bytes:
+            build(command, source, library)
+            return library.read_bytes()
+
+        made, reasons = try_compilers(compile_with, FLAGS)
+    remedy = "install one, or retwin[compiled], or give compiled=False"
+    binary = given("compiled", made, "a C compiler", got=reasons or "none", remedy=remedy)
+    place = platform if version == "2.0" else platform_tuple
+    content[f"binaries/{place}/{identifier}{sharedLibraryExtension}"] = binary

@@ -14,10 +14,14 @@ from retwin.compiler import c_source
 from retwin.deploy.fmu.description import Variable, variables_of
 from retwin.deploy.fmu.text import Text, constants
 from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.limits import Limits
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.discrepancy.domain import Domain
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of
+
+UNUSED = ("start_deviation", "process", "proportional", "free_process")
+"""Variances of corrected dynamics that equations without a discrepancy do not have."""
 
 
 def states_text(twin: StateTwin | DynamicsTwin | CorrectedTwin) -> Text:
@@ -60,36 +64,22 @@ def _convert(given: StateTwin | CorrectedTwin) -> DynamicsTwin:
         values = np.array([named[name] for name in twin.names])
         residual: Any = given.residual
         noise = (residual.spread * residual.scale).double().numpy() ** 2
-    names = twin.names
-    states, inputs = len(twin.states), len(twin.inputs)
-    limits = twin.limits
-    low, high = (
-        (np.zeros(inputs), np.zeros(inputs))
-        if limits is None
-        else (np.array(limits.low, float), np.array(limits.high, float))
-    )
-    starts = values[len(names) - states :]
-    middle = np.clip(0.0, low, high)
-    domain = Domain(
-        np.concatenate([starts, low]),
-        np.concatenate([starts, high]),
-        np.concatenate([starts, middle]),
-        np.ones(states),
-    )
-    nothing = np.zeros(states)
+    states, width = len(twin.states), len(twin.outputs)
+    limits = twin.limits or Limits(*((0.0,) * len(twin.inputs),) * 2)
+    low, high = np.array(limits.low, float), np.array(limits.high, float)
+    starts, middle = values[len(values) - states :], np.clip(0.0, low, high)
+    unused: Any = dict.fromkeys(UNUSED, np.zeros(states))
+    ranges = [*(np.concatenate([starts, each]) for each in (low, high, middle)), np.ones(states)]
     return DynamicsTwin(
-        twin,
-        values,
-        np.zeros((len(values), 0)),
-        nothing,
-        nothing,
-        nothing,
-        nothing,
-        noise,
-        np.ones(len(twin.outputs)),
-        np.zeros(len(twin.outputs)),
-        domain,
-        (),
+        equations=twin,
+        values=values,
+        factor=np.zeros((len(values), 0)),
+        **unused,
+        noise=noise,
+        widening=np.ones(width),
+        constant=np.zeros(width),
+        domain=Domain(*ranges),
+        corrected=(),
         case=getattr(given, "case", ""),
     )
 
@@ -102,11 +92,8 @@ def _variables(twin: DynamicsTwin, ranged: bool) -> tuple[list[Variable], list[i
     # Coefficients of the discrepancy have names of several words.
     shown = [each.name.isidentifier() for each in equations.parameters]
     values = twin.values.tolist()
-    parameters = [
-        (each, value)
-        for each, value, own in zip(equations.parameters, values, shown, strict=False)
-        if own
-    ]
+    pairs = zip(equations.parameters, values, strict=False)
+    parameters = [pair for pair, own in zip(pairs, shown, strict=True) if own]
     starts = [
         (each.name, each.unit, value)
         for each, value in zip(equations.states, values[-states:], strict=True)
@@ -117,12 +104,9 @@ def _variables(twin: DynamicsTwin, ranged: bool) -> tuple[list[Variable], list[i
     first = twin.domain.mean[states:].tolist()
     channels = (equations.inputs, equations.outputs)
     made = variables_of(*channels, first, parameters, starts, limits=limits, ranged=ranged)
-    following = 1 + 2 * inputs + 5 * outputs
-    places = []
-    for own in [*shown, *[True] * states]:
-        places.append(following if own else -1)
-        following += own
-    return made, places
+    listed = np.array([*shown, *[True] * states])
+    places = np.where(listed, 2 * inputs + 5 * outputs + listed.cumsum(), -1)
+    return made, places.tolist()
 
 
 def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
@@ -139,7 +123,6 @@ def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
         "ND": len(delays),
         "PAST": 3 + ceil(max(longest, default=0.0) * twin.rate),
     }
-    numbers = {"PERIOD": 1 / twin.rate}
     arrays: Mapping[str, ArrayLike] = {
         "VALUES": twin.values,
         "FACTOR": twin.factor.ravel(),
@@ -156,7 +139,7 @@ def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
         arrays = {**arrays, "LEAST": low, "GREATEST": high}
     lines = [f"#define {name} {size}" for name, size in sizes.items()]
     lines += ["#define RANGED"] * ranged
-    lines += [f"#define {name} {value!r}" for name, value in numbers.items()]
+    lines.append(f"#define PERIOD {1 / twin.rate!r}")
     lines += [constants(name, values) for name, values in arrays.items()]
     indices = {"PLACE": places, "DELAYED": [u for u, _ in delays], "DEAD": [p for _, p in delays]}
     lines += [constants(name, values, "int") for name, values in indices.items()]

@@ -266,13 +266,7 @@ class Portable:
             return self._corrected(chunk, self._noise(len(chunk.commands), rng))
 
         return simulate_in_chunks(
-            self,
-            run,
-            checked,
-            faults,
-            seed=seed,
-            progress=progress,
-            emulated=self.emulated,
+            self, run, checked, faults, seed=seed, progress=progress, emulated=self.emulated
         )
 
     def _noise(self, count: int, rng: np.random.Generator) -> dict[str, NDArray]:

@@ -135,18 +135,14 @@ def simulate_to(
     with room_for(job.part), in_use(job.part):
         try:
             job.finish(workers, scheduler, report)
-        except InputError as error:
-            # The plan cannot be carried out, although some of its chunks may be finished.
-            if job.done() and earlier:
-                remedy = f"{error.remedy}; what was finished earlier stays in {job.part}"
-                raise InputError(
-                    error.argument, expected=error.expected, got=error.got, remedy=remedy
-                ) from error
-            _remove(job.part)
-            raise
-        except BaseException:
-            if not job.done():
+        except BaseException as error:
+            # A plan that cannot be carried out leaves only what an earlier call has finished.
+            refused = isinstance(error, InputError)
+            if not job.done() or (refused and not earlier):
                 _remove(job.part)
+            elif isinstance(error, InputError):
+                stays = f"{error.remedy}; what was finished earlier stays in {job.part}"
+                raise error.with_parts(remedy=stays) from error
             raise
         return job.moved(target)
 
@@ -310,11 +306,7 @@ def _check_same(where: Path, written: dict[str, Any], given: dict[str, Any]) -> 
     if versions:
         remedy = "give another name, remove that folder, or finish it with that version"
     require(
-        not other,
-        "plan",
-        expected=f"the plan that {where} was begun with",
-        got=got,
-        remedy=remedy,
+        not other, "plan", expected=f"the plan that {where} was begun with", got=got, remedy=remedy
     )
 
 

@@ -268,8 +268,7 @@ def _renumbered(error: InputError, begin: int) -> InputError:
     def counted(found: re.Match[str]) -> str:
         return f"trajectory {begin + int(found[1])}"
 
-    got = re.sub(r"\btrajectory (\d+)\b", counted, error.got)
-    return InputError(error.argument, expected=error.expected, got=got, remedy=error.remedy)
+    return error.with_parts(got=re.sub(r"\btrajectory (\d+)\b", counted, error.got))
 
 
 def _simulated(

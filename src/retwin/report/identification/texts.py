@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import isfinite, isnan
 
-from retwin.cases.measured import CONSTANT
+from retwin.cases.matching import CONSTANT
 from retwin.evaluation.identification import Direction, Identification, ParameterEstimate, RMSError
 from retwin.evaluation.identification.parameters import WIDEST
 from retwin.evaluation.identification.validation import BEGIN

@@ -35,7 +35,7 @@ from retwin.report.labels import (
 )
 from retwin.report.study import Study
 from retwin.report.verdict import headline, outcome_of
-from retwin.source_results import Comparison
+from retwin.results.sources import Comparison
 
 
 def comparisons(study: Study) -> Section | None:

@@ -10,7 +10,7 @@ from retwin.report.figure import Axis, Figure, Key, Panel, Points, Row
 from retwin.report.labels import in_sentence, metric_name, metric_quantity, order, source_name
 from retwin.report.study import Study
 from retwin.report.style import colour_index, colour_of, dash, symbol
-from retwin.source_results import CurvePoint
+from retwin.results.sources import CurvePoint
 
 Curves = dict[str, list[CurvePoint]]
 

@@ -27,7 +27,7 @@ from retwin.report.labels import (
 from retwin.report.study import Study
 from retwin.report.style import colour_of, symbol
 from retwin.results import Results
-from retwin.source_results import SourceResults
+from retwin.results.sources import SourceResults
 
 
 def scores(study: Study) -> Section | None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from retwin.report.blocks import Cell, Section, Table, tabulate, text_column
 from retwin.report.labels import duration, real_data, source_name
 from retwin.report.study import Study
-from retwin.source_results import SourceResults
+from retwin.results.sources import SourceResults
 
 PUBLISHED_BULK, BULK = 3600, 1000
 """The number of trajectories to which generation times refer: in the paper, and elsewhere."""

@@ -94,9 +94,7 @@ class CommandRange:
         share = np.concatenate(list(above)).max(axis=0)
         numbers = dict(zip(ARRAYS, (low, high, change, band, share, power), strict=True))
         return cls(
-            **{k: floats(v) for k, v in numbers.items()},
-            resolution=resolution,
-            count=len(commands),
+            **{k: floats(v) for k, v in numbers.items()}, resolution=resolution, count=len(commands)
         )
 
     @classmethod

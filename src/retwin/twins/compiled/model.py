@@ -84,10 +84,7 @@ class Model:
         """
         program, count = Program(), len(self.variables["u"])
         sizes = {letter: len(nodes) for letter, nodes in self.variables.items()}
-        variables = {
-            letter: tuple(program.variable(f"{letter}[{i}]") for i in range(size))
-            for letter, size in (sizes | {"u": count + len(delays)}).items()
-        }
+        variables = program.variables(**sizes | {"u": count + len(delays)})
         known = {
             node.index: made
             for letter, nodes in self.variables.items()
@@ -220,16 +217,15 @@ def trace_model(
 
     """
     program = Program()
+    listed = dict(zip("xup", names, strict=True))
+    variables = program.variables(**{letter: len(own) for letter, own in listed.items()})
     groups = []
-    for letter, own in zip("xup", names, strict=True):
+    for letter, own in listed.items():
         group = namedtuple(letter, own, rename=True)  # type: ignore[misc]
-        groups.append(group(*(program.variable(f"{letter}[{i}]") for i in range(len(own)))))
+        groups.append(group(*variables[letter]))
     role = "step" if discrete else "derivative"
     slope = traced(function, program, groups, len(names[0]), role)
     made = traced(output, program, groups, outputs, "output")
-    variables: dict[str, tuple[Node, ...]] = {
-        letter: tuple(group) for letter, group in zip("xup", groups, strict=True)
-    }
     return Model(program, variables, slope, made, discrete)
 
 

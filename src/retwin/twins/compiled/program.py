@@ -75,6 +75,13 @@ class Program:
         """The variable of that C name."""
         return self._intern("variable", (), name)
 
+    def variables(self, **sizes: int) -> dict[str, tuple[Node, ...]]:
+        """Variables x[0], x[1], … of each array of C and its size."""
+        return {
+            letter: tuple(self.variable(f"{letter}[{i}]") for i in range(size))
+            for letter, size in sizes.items()
+        }
+
     def constant(self, value: float) -> Node:
         """The constant of that value."""
         return self._intern("constant", (), float(value))
@@ -168,10 +175,7 @@ def _partials(program: Program, node: Node) -> tuple[Partial, ...]:
             # 0 to a positive power is 0 for every such power.
             lambda: node * n("where", n("eq", a, 0.0), 0.0, n("log", a)),
         ),
-        "atan2": (
-            lambda: n("div", b, a * a + b * b),
-            lambda: n("neg", n("div", a, a * a + b * b)),
-        ),
+        "atan2": (lambda: n("div", b, a * a + b * b), lambda: n("neg", n("div", a, a * a + b * b))),
         "exp": (lambda: node,),
         "expm1": (lambda: n("add", node, 1.0),),
         "log": (lambda: n("div", 1.0, a),),

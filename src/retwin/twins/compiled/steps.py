@@ -110,8 +110,13 @@ class Steps:
         process, common = variances[0], (variances[1], np.array([gate]))
         process = np.broadcast_to(process, (*shape, states))
         if library is None:
-            given = (process, measured, changes, spread)
-            return self._filter(commands, theta, given, common, first)
+            c = self.coefficients(_double(commands), _double(theta), first).numpy()
+            if changes is None:
+                changes = np.zeros((*c.shape[:2], len(self.model.variables["p"])))
+            given = zip(c, theta, process, *measured, changes, spread, strict=True)
+            every = [self._filter_row(*map(_double, (*row, *common))) for row in given]
+            mean, covariance, x, after = (np.stack(each) for each in zip(*every, strict=True))
+            return mean, covariance, x, after
         after = np.array(spread, np.float64)
         made = tuple(
             np.empty((*shape, *each)) for each in ((outputs,), (outputs, outputs), (states,))
@@ -123,26 +128,6 @@ class Steps:
         rows = (*self._arrays(commands, theta, first), *seen, changes, after, *made)
         call(library, "filter", (*shape, self.substeps), self.period, shared, rows)
         return made[0], made[1], made[2], after
-
-    def _filter(
-        self,
-        commands: NDArray,
-        theta: NDArray,
-        given: tuple[NDArray, tuple[NDArray, NDArray], NDArray | None, NDArray],
-        common: tuple[NDArray, NDArray],
-        first: int,
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """See `filter`, for one trajectory after the other."""
-        c = self.coefficients(_double(commands), _double(theta), first).numpy()
-        process, measured, changes, spread = given
-        if changes is None:
-            changes = np.zeros((*c.shape[:2], len(self.model.variables["p"])))
-        rows = [
-            self._filter_row(*(_double(each) for each in row), *map(_double, common))
-            for row in zip(c, theta, process, *measured, changes, spread, strict=True)
-        ]
-        mean, covariance, states, after = (np.stack(each) for each in zip(*rows, strict=True))
-        return mean, covariance, states, after
 
     def _filter_row(
         self,

@@ -63,11 +63,7 @@ def equations_from(kind: type[Kind], about: dict[str, Any]) -> Kind:
         Channels(*(tuple(part) for part in about[name])) for name in ("inputs", "outputs")
     )
     program = Program()
-    widths = zip("xup", (len(states), len(inputs), len(parameters)), strict=True)
-    variables = {
-        letter: tuple(program.variable(f"{letter}[{i}]") for i in range(width))
-        for letter, width in widths
-    }
+    variables = program.variables(x=len(states), u=len(inputs), p=len(parameters))
     known = {node.value: node for group in variables.values() for node in group}
     nodes: list[Node] = []
     for op, args, value in about["operations"]:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import at_least, finite, nothing, one_of, require, whole
-from retwin.data.trajectories import Channels, Trajectories
-from retwin.progress import Progress
+from retwin.data.trajectories import Channels
 from retwin.times import sample_rate
 from retwin.twins.equations.interpolation import INTERPOLATIONS
 from retwin.twins.equations.saved_equations import equations_from, equations_of
@@ -21,8 +20,8 @@ from retwin.twins.equations.step_error import warn_of_coarse_steps
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.faults.system_faults import parameter_changes
 from retwin.twins.limits import Limits
-from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
-from retwin.twins.wrappers.parameter_values import values_per_simulation
+from retwin.twins.twin import Chunk, checked_commands
+from retwin.twins.wrappers.parameter_values import AdjustableTwin, values_per_simulation
 from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
 
 if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to import
@@ -41,7 +40,7 @@ FINER = 16
 
 
 @dataclass(frozen=True)
-class StateTwin:
+class StateTwin(AdjustableTwin):
     """A twin whose states follow equations that are written with torch.
 
     `derivative` or `step`, and `output`, are functions of named tuples of scalars: the states x,
@@ -227,35 +226,26 @@ class StateTwin:
         """
         return ParametricTwin(self, self.free)
 
-    def simulate(
-        self,
-        commands: NDArray,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int,
-        progress: Progress | None = None,
-        parameters: Mapping[str, ArrayLike] | None = None,
-    ) -> Trajectories:
-        """See `TakesParameters.simulate`; the parameters are `names`."""
-        commands = checked_commands(commands, self.inputs)
-        values = self.values(parameters, len(commands))
+    @property
+    def _adjustable(self) -> tuple[str, ...]:
+        return self.names
 
-        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            own = values[chunk.index]
-            nominal = self._outputs(chunk, chunk.commands, own)
-            if chunk.index.start == 0 and 0 not in chunk.failed:
-                self.check_accuracy(chunk.commands[:1], own[:1], nominal[:1])
-            held, changes = chunk.held_commands, self.changes(chunk.faults, commands.shape[1])
-            faulty = (held != chunk.commands).any(axis=(1, 2)) | changes.any(axis=(1, 2))
-            observed = nominal.copy()
-            if faulty.any():
-                observed[faulty] = self._outputs(chunk, held, own, changes, faulty)
-            return nominal, observed
+    def _count(self, steps: int) -> int:
+        return max(1, SAMPLES_PER_CHUNK // steps)
 
-        size = max(1, SAMPLES_PER_CHUNK // commands.shape[1])
-        return simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, size=size
-        )
+    def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
+        """Nominal and observed outputs."""
+        count, steps, _ = chunk.commands.shape
+        own = self.values(chunk.parameters, count)
+        nominal = self._outputs(chunk, chunk.commands, own)
+        if chunk.index.start == 0 and 0 not in chunk.failed:
+            self.check_accuracy(chunk.commands[:1], own[:1], nominal[:1])
+        held, changes = chunk.held_commands, self.changes(chunk.faults, steps)
+        faulty = (held != chunk.commands).any(axis=(1, 2)) | changes.any(axis=(1, 2))
+        observed = nominal.copy()
+        if faulty.any():
+            observed[faulty] = self._outputs(chunk, held, own, changes, faulty)
+        return nominal, observed
 
     def hidden(
         self, commands: NDArray, parameters: Mapping[str, ArrayLike] | None = None

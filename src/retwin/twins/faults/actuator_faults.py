@@ -66,9 +66,10 @@ class Fault(Protocol):
         Returns
         -------
         ndarray, shape (T, d_u)
-            Effective commands.
+            Effective commands; by default the clean ones.
 
         """
+        return commands
 
     def response(self, response: NDArray, rate: float) -> NDArray:
         """Response of the actuators under the fault.
@@ -83,9 +84,10 @@ class Fault(Protocol):
         Returns
         -------
         ndarray, shape (T, d_u)
-            The response with the fault.
+            The response with the fault; by default the same.
 
         """
+        return response
 
 
 def ends_of(value: Any) -> tuple[float, float]:
@@ -128,7 +130,7 @@ _onset_samples = lru_cache(maxsize=1024)(onset_samples)
 
 
 @dataclass(frozen=True)
-class Stuck:
+class Stuck(Fault):
     """The actuator's response is held from an onset on.
 
     Parameters
@@ -172,10 +174,6 @@ class Stuck:
             return self
         return replace(self, onset=int(rng.integers(low, high + 1)) / rate)
 
-    def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
-        """The clean commands: the fault acts on the response. See `Fault.command`."""
-        return commands
-
     def response(self, response: NDArray, rate: float) -> NDArray:
         """The response, constant from the onset on; see `Fault.response`."""
         if isinstance(self.onset, tuple):
@@ -187,7 +185,7 @@ class Stuck:
 
 
 @dataclass(frozen=True)
-class ActuatorBias:
+class ActuatorBias(Fault):
     """A bias of the actuator's reference, one per segment: the paper's steady-state error (SSE).
 
     The bias builds up along the ramp of each segment: the reference goes from the old biased
@@ -258,10 +256,6 @@ class ActuatorBias:
         biased = commands.copy()
         biased[:, self.actuator] += bias
         return biased
-
-    def response(self, response: NDArray, rate: float) -> NDArray:
-        """The response unchanged: it follows the biased reference. See `Fault.response`."""
-        return response
 
 
 def _along(clean: NDArray, start: NDArray, settle: NDArray, levels: NDArray) -> NDArray:

@@ -81,16 +81,10 @@ def faulty_commands(
     out = commands.copy()
     count = segments.valid.sum(axis=1).tolist()
     # What is computed together: many trajectories with the same kind of fault are common.
-    biased = [type(each) is ActuatorBias and n > 0 for each, n in zip(faults, count, strict=True)]
-    rows = zip(faults, biased, count, strict=True)
-    biases = [
-        fault.levels(n) if suits and isinstance(fault, ActuatorBias) else ()
-        for fault, suits, n in rows
-    ]
-    actuators = [
-        getattr(fault, "actuator", -1) if suits else -1
-        for fault, suits in zip(faults, biased, strict=True)
-    ]
+    pairs = list(zip(faults, count, strict=True))
+    biased = [each if type(each) is ActuatorBias and n > 0 else None for each, n in pairs]
+    biases = [each.levels(n) if each else () for each, n in zip(biased, count, strict=True)]
+    actuators = [each.actuator if each else -1 for each in biased]
     together = any(biased) and biased_references(commands, out, actuators, biases, segments)
     for i, fault in enumerate(faults):
         if fault is None or (together and biased[i]):

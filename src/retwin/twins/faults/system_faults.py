@@ -28,7 +28,7 @@ from retwin.twins.faults.actuator_faults import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class TimedFault:
+class TimedFault(Fault):
     """The base of faults that act from an onset to an end.
 
     Parameters
@@ -94,14 +94,6 @@ class TimedFault:
         onset, end = self.onset_range(steps, rate)[0], self.end_range(steps, rate)[0]
         index = np.arange(steps)
         return (index >= onset) & (index < end)
-
-    def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
-        """The commands unchanged, unless the fault is one of an actuator; see `Fault.command`."""
-        return commands
-
-    def response(self, response: NDArray, rate: float) -> NDArray:
-        """The response unchanged; see `Fault.response`."""
-        return response
 
     def measured(self, outputs: NDArray, rate: float) -> NDArray:
         """What sensors measure of outputs (T, d_y); unchanged, unless it is a fault of a sensor."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import prod
 from typing import Any
 
@@ -14,38 +13,8 @@ from numpy.typing import NDArray
 from retwin.twins.fmu.model import Scalar
 
 
-@dataclass(frozen=True, eq=False)
 class VariableGroup:
-    """Numbers of one type, which FMI sets and gets together.
-
-    Parameters
-    ----------
-    kind : str
-        Name of the type in FMI's functions.
-    element : ctypes type
-        Its type in C.
-    variables : list of fmpy.model_description.ModelVariable
-        The variables, each once.
-    columns : list of int
-        Columns of the channels.
-    places : list of int
-        Their places among the values of all variables.
-    count : int
-        The number of values of all variables.
-
-    """
-
-    kind: str
-    element: Any
-    variables: list[Any]
-    columns: list[int]
-    places: list[int]
-    count: int
-
-
-@dataclass(frozen=True, eq=False)
-class Access:
-    """How numbers of an instance are set and read.
+    """Numbers of one type of an instance, which FMI sets and gets together.
 
     Parameters
     ----------
@@ -53,72 +22,67 @@ class Access:
         The instance.
     version : int
         Major version of FMI, 2 or 3.
+    kind : str
+        The type of the variables.
+    scalars : sequence of Scalar
+        Channels, of which those of this type belong to the group.
+
+    Attributes
+    ----------
+    columns : list of int
+        Columns of its channels.
+    places : list of int
+        Their places among the values of all its variables.
 
     """
 
-    slave: Any
-    version: int
-
-    def setters(self, inputs: Sequence[Scalar], table: NDArray) -> list[Callable[[int], None]]:
-        """Functions that set the inputs to row k of `table` (K, d_u), one for each type."""
-        return [self._setter(group, table) for group in self._groups(inputs)]
-
-    def getters(
-        self, outputs: Sequence[Scalar], count: int
-    ) -> list[tuple[VariableGroup, NDArray, Callable[[int], None]]]:
-        """For each type the outputs, an array for `count` samples, and what fills its row k."""
-        return [self._getter(group, count) for group in self._groups(outputs)]
-
-    def _groups(self, scalars: Sequence[Scalar]) -> list[VariableGroup]:
-        """The numbers of each type: FMI has one function per type."""
-        groups = []
-        for kind in dict.fromkeys(each.variable.type for each in scalars):
-            columns = [i for i, each in enumerate(scalars) if each.variable.type == kind]
-            variables = {scalars[i].variable.name: scalars[i].variable for i in columns}
-            sizes = [prod(variable.shape) for variable in variables.values()]
-            first = dict(zip(variables, np.cumsum([0, *sizes]).tolist(), strict=False))
-            places = [first[scalars[i].variable.name] + scalars[i].place for i in columns]
-            name, element = self._type(kind)
-            groups.append(
-                VariableGroup(name, element, list(variables.values()), columns, places, sum(sizes))
-            )
-        return groups
-
-    def _setter(self, group: VariableGroup, table: NDArray) -> Callable[[int], None]:
-        """A function that sets the inputs of a group to row k of `table`.
-
-        Elements of an array that are no channels keep their start values.
-        """
-        starts = [_starts(variable) for variable in group.variables]
-        rows = np.tile(np.concatenate(starts), (len(table), 1))
-        rows[:, group.places] = table[:, group.columns]
-        return self._call("Set", group, _as_type(rows, group))
-
-    def _getter(
-        self, group: VariableGroup, count: int
-    ) -> tuple[VariableGroup, NDArray, Callable[[int], None]]:
-        """A group, an array for its outputs at `count` samples, and a function that fills row k."""
-        rows = np.zeros((count, group.count), group.element)
-        return group, rows, self._call("Get", group, rows)
-
-    def _type(self, kind: str) -> tuple[str, Any]:
-        """The name of a type in FMI's functions, and the type in C."""
+    def __init__(self, slave: Any, version: int, kind: str, scalars: Sequence[Scalar]) -> None:
         from fmpy import fmi2, fmi3
 
-        if kind == "Enumeration":
-            kind = "Integer" if self.version == 2 else "Int64"
-        return kind, getattr(fmi2 if self.version == 2 else fmi3, f"fmi{self.version}{kind}")
+        two = version == 2
+        self._kind = {"Enumeration": "Integer" if two else "Int64"}.get(kind, kind)
+        self._element = getattr(fmi2 if two else fmi3, f"fmi{version}{self._kind}")
+        self._slave, self._version = slave, version
+        self.columns = [i for i, each in enumerate(scalars) if each.variable.type == kind]
+        own = [scalars[i] for i in self.columns]
+        self._variables = {each.variable.name: each.variable for each in own}
+        sizes = [prod(variable.shape) for variable in self._variables.values()]
+        first = dict(zip(self._variables, np.cumsum([0, *sizes]).tolist(), strict=False))
+        self.places = [first[each.variable.name] + each.place for each in own]
+        self._count = sum(sizes)
 
-    def _call(self, verb: str, group: VariableGroup, rows: NDArray) -> Callable[[int], None]:
-        """FMI's function that gets or sets a group for row k of `rows`; twice as fast as FMPy's."""
+    def setter(self, table: NDArray) -> Callable[[int], None]:
+        """A function that sets the inputs of the group to row k of a table (K, d_u).
+
+        Elements of an array that are no channels keep their start values. Whole numbers are
+        rounded, and clipped to the range of their type.
+        """
+        starts = [_starts(variable) for variable in self._variables.values()]
+        rows = np.tile(np.concatenate(starts), (len(table), 1))
+        rows[:, self.places] = table[:, self.columns]
+        dtype = np.dtype(self._element)
+        if dtype.kind != "f":
+            boolean = self._kind == "Boolean"
+            low, high = (0, 1) if boolean else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+            rows = np.clip(np.rint(rows), low, high)
+        return self._call("Set", np.ascontiguousarray(rows, dtype))
+
+    def getter(self, count: int) -> tuple[NDArray, Callable[[int], None]]:
+        """An array for the values of the group at `count` samples, and what fills its row k."""
+        rows = np.zeros((count, self._count), self._element)
+        return rows, self._call("Get", rows)
+
+    def _call(self, verb: str, rows: NDArray) -> Callable[[int], None]:
+        """FMI's function that gets or sets the group for row k of `rows`; faster than FMPy's."""
         from fmpy.fmi1 import FMICallException
 
-        count = len(group.variables)
-        references = (ctypes.c_uint32 * count)(*(each.valueReference for each in group.variables))
-        buffers = (group.element * group.count * len(rows)).from_buffer(rows)
-        name = f"fmi{self.version}{verb}{group.kind}"
-        function, component = self.slave._functions[name], self.slave.component
-        size = () if self.version == 2 else (group.count,)
+        count = len(self._variables)
+        numbers = (each.valueReference for each in self._variables.values())
+        references = (ctypes.c_uint32 * count)(*numbers)
+        buffers = (self._element * self._count * len(rows)).from_buffer(rows)
+        name = f"fmi{self._version}{verb}{self._kind}"
+        function, component = self._slave._functions[name], self._slave.component
+        size = () if self._version == 2 else (self._count,)
 
         def call(k: int) -> None:
             status = function(component, references, count, buffers[k], *size)
@@ -128,18 +92,14 @@ class Access:
         return call
 
 
+def groups_of(slave: Any, version: int, scalars: Sequence[Scalar]) -> list[VariableGroup]:
+    """The numbers of each type: FMI has one function per type."""
+    kinds = dict.fromkeys(each.variable.type for each in scalars)
+    return [VariableGroup(slave, version, kind, scalars) for kind in kinds]
+
+
 def _starts(variable: Any) -> NDArray:
     """Start values of all elements of a variable; 0 where it declares none."""
     texts = str(variable.start or "0").split()
     numbers = [float({"false": 0, "true": 1}.get(text, text)) for text in texts]
     return np.resize(numbers, prod(variable.shape))
-
-
-def _as_type(values: NDArray, group: VariableGroup) -> NDArray:
-    """`values` as C type; whole numbers are rounded and clipped to the range of the type."""
-    dtype = np.dtype(group.element)
-    if dtype.kind != "f":
-        boolean = group.kind == "Boolean"
-        low, high = (0, 1) if boolean else (np.iinfo(dtype).min, np.iinfo(dtype).max)
-        values = np.clip(np.rint(values), low, high)
-    return np.ascontiguousarray(values, dtype)

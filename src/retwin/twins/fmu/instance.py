@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.twins.fmu.access import Access
+from retwin.twins.fmu.access import groups_of
 from retwin.twins.fmu.model import NUMBERS, find_scalars
 from retwin.workers.process import Retired, more_time
 
@@ -237,9 +237,12 @@ class Instance:
         """Outputs at the samples; in each step the FMU has the inputs of its begin."""
         step = 1.0 / (self.job.rate * self.job.substeps)
         steps = (len(commands) - 1) * self.job.substeps
-        access = Access(self.slave, self.version)
-        setters = access.setters(self.inputs, self._table(commands))
-        getters = access.getters(self.outputs, len(commands))
+        inputs, groups = (
+            groups_of(self.slave, self.version, some) for some in (self.inputs, self.outputs)
+        )
+        table = self._table(commands)
+        setters = [each.setter(table) for each in inputs]
+        getters = [(each, *each.getter(len(commands))) for each in groups]
         begin = self._initialise(values, setters, steps * step)
         for _, _, get in getters:
             get(0)

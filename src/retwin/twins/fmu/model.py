@@ -297,9 +297,7 @@ def _settable(description: Any) -> dict[str, Any]:
     }
 
 
-def adjustable(
-    description: Any,
-) -> list[tuple[str, str, float | None, float | None, float | None]]:
+def adjustable(description: Any) -> list[tuple[str, str, float | None, float | None, float | None]]:
     """Numbers that can be set before a run.
 
     Parameters

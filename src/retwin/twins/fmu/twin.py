@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -251,14 +251,9 @@ class FMUTwin:
                 return made
 
             try:
+                size = TRAJECTORIES_PER_CHUNK
                 return simulate_in_chunks(
-                    self,
-                    run,
-                    commands,
-                    faults,
-                    seed=seed,
-                    progress=None,
-                    size=TRAJECTORIES_PER_CHUNK,
+                    self, run, commands, faults, seed=seed, progress=None, size=size
                 )
             finally:
                 self._warn(notes, ended)
@@ -278,14 +273,8 @@ class FMUTwin:
 
     def _workers(self, count: int) -> AbstractContextManager[IsolatedPool]:
         """Processes that have loaded the FMU, for `count` trajectories."""
-        job = RunSettings(
-            inputs=self.inputs.names,
-            outputs=self.outputs.names,
-            rate=self.rate,
-            substeps=self.substeps,
-            rates=dict(self.rates),
-            reuse=self.reuse,
-        )
+        names = self.inputs.names, self.outputs.names
+        job = RunSettings(*names, self.rate, self.substeps, dict(self.rates), self.reuse)
         workers = min(self.workers or os.cpu_count() or 1, count)
         state = self.path.stat()
         version = (self.path, state.st_mtime_ns, state.st_size)
@@ -321,7 +310,9 @@ class FMUTwin:
         changed = (held != clean).any(axis=(1, 2))
         if self.nominal is None:
             runs += [(nominal, i, clean[i]) for i in np.flatnonzero(changed).tolist()]
-        futures = [self._schedule(pool, commands, values[i]) for _, i, commands in runs]
+        size = 8 * clean.shape[1] * len(self.outputs)
+        task = partial(pool.schedule, f"{TASKS}:run", timeout=self.timeout, size=size)
+        futures = [task(values[i], [commands]) for _, i, commands in runs]
         for done, ((outputs, i, _), future) in enumerate(zip(runs, futures, strict=True), 1):
             outcome = self._outcome(future)
             if outcome.reason:
@@ -340,12 +331,6 @@ class FMUTwin:
             return nominal_outputs(self.nominal, clean, len(self.outputs)), observed
         nominal[~changed] = observed[~changed]
         return nominal, observed
-
-    def _schedule(self, pool: IsolatedPool, commands: NDArray, values: Start) -> Future[Frame]:
-        """The outcome of one run, in the future."""
-        size = 8 * len(commands) * len(self.outputs)
-        task = f"{TASKS}:run"
-        return pool.schedule(task, values, [commands], timeout=self.timeout, size=size)
 
     def _outcome(self, future: Future[Frame]) -> Outcome:
         """The outcome of a run, also of one that harmed its process."""

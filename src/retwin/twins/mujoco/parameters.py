@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import mujoco
 import numpy as np
@@ -76,11 +78,7 @@ def parameter_value(model: mujoco.MjModel, name: str) -> float:
         There is no such field.
 
     """
-    parts = PLACE.fullmatch(name)
-    try:
-        if parts is None:
-            raise KeyError("no such form")
-        index = int(parts["index"] or parts["at"] or 0)
+    with _parts(name) as (parts, index):
         if parts["option"]:
             return float(np.ravel(getattr(model.opt, parts["option"]))[index])
         kind, field = parts["kind"], parts["field"]
@@ -89,17 +87,25 @@ def parameter_value(model: mujoco.MjModel, name: str) -> float:
             return float(np.ravel(getattr(place, field))[index])
         # MuJoCo 4 hides the fields of tendons behind other names, but not the arrays of them all.
         return float(np.ravel(getattr(model, f"{kind}_{field}")[place.id])[index])
+
+
+@contextmanager
+def _parts(name: str) -> Iterator[tuple[re.Match[str], int]]:
+    """The parts of a field's name, and its index; what fails in the block is an InputError."""
+    try:
+        parts = PLACE.fullmatch(name)
+        if parts is None:
+            raise KeyError("no such form")
+        yield parts, int(parts["index"] or parts["at"] or 0)
+    except InputError:
+        raise
     except (KeyError, AttributeError, ValueError, IndexError, TypeError) as error:
-        raise _no_such_field(name, error) from None
-
-
-def _no_such_field(name: str, error: Exception) -> InputError:
-    return InputError(
-        "parameters",
-        expected='"KIND.NAME.FIELD[INDEX]" as in "joint.hip.damping", or "opt.FIELD[INDEX]"',
-        got=f"{name!r} ({' '.join(str(error.args[0]).split())})",
-        remedy="name a body, joint, actuator, … of the model and one of its number fields",
-    )
+        raise InputError(
+            "parameters",
+            expected='"KIND.NAME.FIELD[INDEX]" as in "joint.hip.damping", or "opt.FIELD[INDEX]"',
+            got=f"{name!r} ({' '.join(str(error.args[0]).split())})",
+            remedy="name a body, joint, actuator, … of the model and one of its number fields",
+        ) from None
 
 
 def set_parameter(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None:
@@ -121,18 +127,14 @@ def set_parameter(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None
         There is no such field, or all simulations must share it.
 
     """
-    parts = PLACE.fullmatch(name)
-    require(
-        parts is None or parts["option"] not in SHARED_OPTIONS,
-        "parameters",
-        expected="numbers that may differ between simulations",
-        got=f"{name!r}, which they share",
-        remedy="set it in the model, or give the twin another step",
-    )
-    try:
-        if parts is None:
-            raise KeyError("no such form")
-        index = int(parts["index"] or parts["at"] or 0)
+    with _parts(name) as (parts, index):
+        require(
+            parts["option"] not in SHARED_OPTIONS,
+            "parameters",
+            expected="numbers that may differ between simulations",
+            got=f"{name!r}, which they share",
+            remedy="set it in the model, or give the twin another step",
+        )
         if parts["option"]:
             field = batch.expand(f"opt.{parts['option']}")
             field.reshape(len(values), -1)[:, index] = values
@@ -145,5 +147,3 @@ def set_parameter(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None
         field = np.array(getattr(place, parts["field"]))
         field.reshape(len(values), -1)[:, index] = values
         setattr(place, parts["field"], field)
-    except (KeyError, AttributeError, ValueError, IndexError) as error:
-        raise _no_such_field(name, error) from None

@@ -143,9 +143,9 @@ class MuJoCoSimulation:
     ) -> dict[str, NDArray]:
         """Fields at every sample, (n, T, size); joints are locked at their onsets."""
         sub, last = self.substeps, controls.shape[1]
+        columns = {name: self._columns if name == "sensordata" else slice(None) for name in fields}
         recorded = {}
-        for name in fields:
-            width = self._columns if name == "sensordata" else slice(None)
+        for name, width in columns.items():
             recorded[name] = np.empty((len(controls), steps, *batch.bind(name)[0, width].shape))
             recorded[name][:, 0] = batch.bind(name)[:, width]
         held = frozen < steps
@@ -158,11 +158,10 @@ class MuJoCoSimulation:
                 damping[i, dof] = LOCKED
                 batch.bind("qvel")[i, dof] = 0.0
             part = batch.rollout(int(end - begin), controls[:, begin:end], record=fields)
-            for name in fields:
+            for name, width in columns.items():
                 # Sensor data are of the begin of a step, states of its end.
                 at = np.arange(begin, end) + (name != "sensordata")
                 keep = (at % sub == 0) & (at < steps * sub)
-                width = self._columns if name == "sensordata" else slice(None)
                 recorded[name][:, at[keep] // sub] = part[name][:, keep][:, :, width]
         return recorded
 

@@ -20,12 +20,7 @@ from retwin.times import sample_rate
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.mujoco.actuators import limits_of
-from retwin.twins.mujoco.model import (
-    Servo,
-    compiled,
-    input_channels,
-    output_channels,
-)
+from retwin.twins.mujoco.model import Servo, compiled, input_channels, output_channels
 from retwin.twins.mujoco.simulation import MuJoCoSimulation
 from retwin.twins.time_step import steps_per_sample
 from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from retwin.arrays import interpolated
-from retwin.data.segments import Segments
-from retwin.data.trajectories import Channels, Trajectories
-from retwin.progress import Progress
+from retwin.data.trajectories import Channels
 from retwin.twins.faults.actuator_faults import Fault
-from retwin.twins.twin import (
-    Chunk,
-    Twin,
-    checked_commands,
-    nominal_outputs,
-    simulate_in_chunks,
-)
-from retwin.twins.wrappers.parameter_values import values_per_simulation
+from retwin.twins.twin import Chunk, Twin, nominal_outputs
+from retwin.twins.wrappers.parameter_values import AdjustableTwin
 from retwin.twins.wrappers.parametric import Parameter
-from retwin.twins.wrappers.rebuilt import TRAJECTORIES_PER_CHUNK
 from retwin.twins.wrappers.wrapper import TwinWrapper, simulate_chunk
 
 DELAY = "delay"
@@ -32,7 +23,7 @@ OFFSET = "offset"
 
 
 @dataclass(frozen=True)
-class CommandSide(TwinWrapper):
+class CommandSide(AdjustableTwin, TwinWrapper):
     """Any twin whose commands are delayed and offset: parameters `delay` and `offset.CHANNEL`.
 
     The transport delay in s is the same for all actuators. Each actuator has an offset in its
@@ -53,54 +44,24 @@ class CommandSide(TwinWrapper):
     twin: Twin
     nominal: Callable[[NDArray], NDArray] | None = None
 
-    def simulate(
-        self,
-        commands: NDArray,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int,
-        progress: Progress | None = None,
-        parameters: Mapping[str, ArrayLike] | None = None,
-    ) -> Trajectories:
-        """See `TakesParameters.simulate`."""
-        commands = checked_commands(commands, self.inputs)
-        count = len(commands)
-        offsets = tuple(f"{OFFSET}.{name}" for name in self.inputs.names)
-        given = dict(parameters or {})
-        own = {name: given.pop(name) for name in (DELAY, *offsets) if name in given}
-        own_values = values_per_simulation(own, count, allowed=(DELAY, *offsets))
-        inner_values = values_per_simulation(given, count)
-        delay = own_values.get(DELAY, np.zeros(count))
-        offset = np.stack([own_values.get(name, np.zeros(count)) for name in offsets], axis=-1)
-
-        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            rows = np.arange(len(chunk.commands))
-            options = {name: each[chunk.index] for name, each in inner_values.items()}
-            late = delay[chunk.index, None] * self.rate
-            delayed = interpolated(chunk.faulty_commands, np.arange(commands.shape[1]) - late)
-            effective = self._clip(delayed + offset[chunk.index][:, None])
-            responses: list[Fault | None] = [
-                None if fault is None else _ResponseOnly(fault) for fault in chunk.faults
-            ]
-            simulate = partial(
-                simulate_chunk, self.twin, chunk, rows, seed=seed, parameters=options
-            )
-            _, observed = simulate(effective, responses)
-            if self.nominal is not None:
-                return nominal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
-            healthy: list[Fault | None] = [None] * len(rows)
-            nominal, _ = simulate(chunk.commands, healthy)
-            return nominal, observed
-
-        return simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
-        )
-
-    def _clip(self, commands: NDArray) -> NDArray:
-        """Commands (n, T, d_u) within the twin's limits: an actuator goes no further."""
-        if self.limits is None:
-            return commands
-        return np.clip(commands, self.limits.low, self.limits.high)
+    def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
+        """Nominal and observed outputs."""
+        count, steps, _ = chunk.commands.shape
+        rows, inner = np.arange(count), dict(chunk.parameters)
+        offsets = (f"{OFFSET}.{name}" for name in self.inputs.names)
+        late = inner.pop(DELAY, np.zeros(count))[:, None] * self.rate
+        offset = np.stack([inner.pop(name, np.zeros(count)) for name in offsets], axis=-1)
+        delayed = interpolated(chunk.faulty_commands, np.arange(steps) - late)
+        effective = delayed + offset[:, None]
+        if self.limits is not None:  # an actuator goes no further
+            effective = np.clip(effective, self.limits.low, self.limits.high)
+        responses = [fault and _ResponseOnly(fault) for fault in chunk.faults]
+        given: Any = {"seed": chunk.seed, "parameters": inner}
+        _, observed = simulate_chunk(self.twin, chunk, rows, effective, responses, **given)
+        if self.nominal is not None:
+            return nominal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
+        nominal, _ = simulate_chunk(self.twin, chunk, rows, faults=[None] * count, **given)
+        return nominal, observed
 
 
 def command_side_parameters(
@@ -132,7 +93,7 @@ def command_side_parameters(
 
 
 @dataclass(frozen=True)
-class _ResponseOnly:
+class _ResponseOnly(Fault):
     """A fault without its effect on the reference, which has been applied already."""
 
     fault: Fault
@@ -147,10 +108,6 @@ class _ResponseOnly:
     ) -> _ResponseOnly:
         """The fault itself: its severity is fixed already."""
         return self
-
-    def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
-        """The commands unchanged."""
-        return commands
 
     def response(self, response: NDArray, rate: float) -> NDArray:
         """The response with the fault."""

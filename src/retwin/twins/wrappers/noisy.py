@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +10,8 @@ from numpy.typing import NDArray
 from retwin.arrays import interpolated
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
-from retwin.progress import Progress
 from retwin.times import stride_of
-from retwin.twins.faults.actuator_faults import Fault
-from retwin.twins.twin import Chunk, Twin, check_healthy, simulate_in_chunks
+from retwin.twins.twin import Chunk, ChunkedTwin, Twin, check_healthy
 from retwin.twins.wrappers.wrapper import TwinWrapper, chunk_generator, simulate_chunk
 
 OUTPUT_NOISE = 4
@@ -22,7 +19,7 @@ OUTPUT_NOISE = 4
 
 
 @dataclass(frozen=True, eq=False)
-class NoisyTwin(TwinWrapper):
+class NoisyTwin(ChunkedTwin, TwinWrapper):
     """Any twin with independent Gaussian noise on every sample of its sensor.
 
     The baseline that models the discrepancy as white noise: of the right variance, without
@@ -65,28 +62,15 @@ class NoisyTwin(TwinWrapper):
         object.__setattr__(self, "scale", scale)
         stride_of(self.rate, self.sensor_rate, argument="sensor_rate")
 
-    def simulate(
-        self,
-        commands: NDArray,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int,
-        progress: Progress | None = None,
-    ) -> Trajectories:
-        """See `Twin.simulate`; noise is added last, to faulty trajectories too."""
+    def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
+        """Nominal and observed outputs; noise is added last, to faulty trajectories too."""
         every = stride_of(self.rate, self.sensor_rate)
-
-        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            rows = np.arange(len(chunk.commands))
-            nominal, observed = simulate_chunk(self.twin, chunk, rows, seed=seed)
-            count, steps, width = observed.shape
-            shape = (count, sensor_sample_count(steps, every), width)
-            noise = self.scale * chunk_generator(seed, chunk, OUTPUT_NOISE).normal(size=shape)
-            return nominal, observed + interpolated(noise, np.arange(steps), every)
-
-        return simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, emulated=self.emulated
-        )
+        rows = np.arange(len(chunk.commands))
+        nominal, observed = simulate_chunk(self.twin, chunk, rows, seed=chunk.seed)
+        count, steps, width = observed.shape
+        shape = (count, sensor_sample_count(steps, every), width)
+        noise = self.scale * chunk_generator(chunk.seed, chunk, OUTPUT_NOISE).normal(size=shape)
+        return nominal, observed + interpolated(noise, np.arange(steps), every)
 
 
 def residual_scale(calibration: Trajectories) -> NDArray:

@@ -1,13 +1,18 @@
-"""Values of parameters that differ between simulations."""
+"""Values of parameters that differ between simulations, and the base of twins that take them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import one_of, require
+from retwin.data.trajectories import Trajectories
+from retwin.progress import Progress
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.twin import checked_commands, simulate_in_chunks
 
 
 def values_per_simulation(
@@ -51,3 +56,34 @@ def values_per_simulation(
         )
         values[name] = np.broadcast_to(array.astype(float), count)
     return values
+
+
+class AdjustableTwin:
+    """The base of twins that simulate by `_run` with parameters, `Chunk.parameters`."""
+
+    @property
+    def _adjustable(self) -> Sequence[str] | None:
+        """Names of its parameters; None where any are passed on."""
+        return None
+
+    def _count(self, steps: int) -> int:
+        """Trajectories of so many samples that are simulated together, at most."""
+        return 512
+
+    def simulate(
+        self,
+        commands: NDArray,
+        *,
+        faults: Sequence[Fault | None] | None = None,
+        seed: int,
+        progress: Progress | None = None,
+        parameters: Mapping[str, ArrayLike] | None = None,
+    ) -> Trajectories:
+        """See `TakesParameters.simulate`."""
+        twin: Any = self  # with the channels and the rate of the subclass
+        commands = checked_commands(commands, twin.inputs)
+        values = values_per_simulation(parameters, len(commands), allowed=self._adjustable)
+        how: Any = {"size": self._count(commands.shape[1]), "parameters": values}
+        return simulate_in_chunks(
+            twin, twin._run, commands, faults, seed=seed, progress=progress, **how
+        )

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.data.trajectories import Trajectories
-from retwin.progress import Progress
-from retwin.twins.faults.actuator_faults import Fault
-from retwin.twins.twin import Chunk, nominal_outputs, simulate_in_chunks
+from retwin.twins.twin import Chunk, ChunkedTwin, nominal_outputs
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.twins.wrappers.wrapper import TwinWrapper, chunk_generator, simulate_chunk
 
@@ -20,7 +16,7 @@ PARAMETERS = 3
 
 
 @dataclass(frozen=True)
-class RandomisedTwin(TwinWrapper):
+class RandomisedTwin(ChunkedTwin, TwinWrapper):
     """A twin whose parameters are drawn uniformly within their bounds, per trajectory.
 
     The baseline that needs no real data. It is as good as its bounds, which have to be set without
@@ -41,23 +37,12 @@ class RandomisedTwin(TwinWrapper):
 
     twin: ParametricTwin
 
-    def simulate(
-        self,
-        commands: NDArray,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int,
-        progress: Progress | None = None,
-    ) -> Trajectories:
-        """See `Twin.simulate`."""
+    def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
+        """Nominal and observed outputs."""
         low, high = self.twin.bounds
-
-        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            rng = chunk_generator(seed, chunk, PARAMETERS)
-            drawn = rng.uniform(low, high, size=(len(chunk.commands), len(low)))
-            return simulate_with_parameters(self.twin, chunk, drawn, seed=seed)
-
-        return simulate_in_chunks(self, run, commands, faults, seed=seed, progress=progress)
+        rng = chunk_generator(chunk.seed, chunk, PARAMETERS)
+        drawn = rng.uniform(low, high, size=(len(chunk.commands), len(low)))
+        return simulate_with_parameters(self.twin, chunk, drawn, seed=chunk.seed)
 
 
 def simulate_with_parameters(

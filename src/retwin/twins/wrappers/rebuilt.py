@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from retwin.checks import require
-from retwin.data.trajectories import Trajectories
-from retwin.progress import Progress
-from retwin.twins.faults.actuator_faults import Fault
-from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
-from retwin.twins.wrappers.parameter_values import values_per_simulation
+from retwin.twins.twin import Chunk, Twin
+from retwin.twins.wrappers.parameter_values import AdjustableTwin
 from retwin.twins.wrappers.wrapper import TwinWrapper, simulate_chunk
-
-TRAJECTORIES_PER_CHUNK = 512
-"""Number of trajectories that are passed to the wrapped twin together."""
 
 
 @dataclass(frozen=True)
-class RebuiltTwin(TwinWrapper):
+class RebuiltTwin(AdjustableTwin, TwinWrapper):
     """A twin that is built anew for each combination of parameter values.
 
     Trajectories with equal values are simulated together.
@@ -60,33 +54,21 @@ class RebuiltTwin(TwinWrapper):
         )
         return made
 
-    def simulate(
-        self,
-        commands: NDArray,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int,
-        progress: Progress | None = None,
-        parameters: Mapping[str, ArrayLike] | None = None,
-    ) -> Trajectories:
-        """See `TakesParameters.simulate`."""
-        commands = checked_commands(commands, self.inputs)
-        names = tuple(self.defaults)
-        values = values_per_simulation(parameters, len(commands), allowed=names)
-        table = np.stack(
-            [values.get(n, np.full(len(commands), self.defaults[n])) for n in names], 1
-        )
+    @property
+    def _adjustable(self) -> tuple[str, ...]:
+        return tuple(self.defaults)
 
-        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            nominal = np.zeros((*chunk.commands.shape[:2], len(self.outputs)))
-            observed = np.zeros_like(nominal)
-            distinct, group = np.unique(table[chunk.index], axis=0, return_inverse=True)
-            for i, theta in enumerate(distinct):
-                rows = np.flatnonzero(group.ravel() == i)
-                twin = self.build(dict(zip(names, theta.tolist(), strict=True)))
-                nominal[rows], observed[rows] = simulate_chunk(twin, chunk, rows, seed=seed)
-            return nominal, observed
-
-        return simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
-        )
+    def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
+        """Nominal and observed outputs."""
+        count, steps, _ = chunk.commands.shape
+        columns = {name: np.full(count, value) for name, value in self.defaults.items()}
+        columns |= chunk.parameters
+        nominal = np.zeros((count, steps, len(self.outputs)))
+        observed = np.zeros_like(nominal)
+        table = np.stack(list(columns.values()), 1)
+        distinct, group = np.unique(table, axis=0, return_inverse=True)
+        for i, theta in enumerate(distinct):
+            rows = np.flatnonzero(group.ravel() == i)
+            twin = self.build(dict(zip(columns, theta.tolist(), strict=True)))
+            nominal[rows], observed[rows] = simulate_chunk(twin, chunk, rows, seed=chunk.seed)
+        return nominal, observed

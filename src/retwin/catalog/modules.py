@@ -83,10 +83,7 @@ class _Finder(MetaPathFinder):
             return spec
         inside = [str(file.parent)] if file.name == "__init__.py" else None
         return spec_from_file_location(
-            fullname,
-            file,
-            loader=_Loader(fullname, str(file)),
-            submodule_search_locations=inside,
+            fullname, file, loader=_Loader(fullname, str(file)), submodule_search_locations=inside
         )
 
 

@@ -4,13 +4,18 @@ An entry states a name, a title and where the implementation is, as `package.mod
 implementation is imported when it is resolved, so that the command line, its completion, the
 report and the documentation read this module without waiting for torch. To add an implementation,
 write its module and add one entry here.
+
+Belongs here: names, titles, the kinds of entries, and how modules are found by their names. Not
+here: implementations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
 
-from retwin.entries import (
+from retwin.catalog.entries import (
     CaseEntry,
     Entry,
     Extra,
@@ -20,61 +25,24 @@ from retwin.entries import (
     Need,
     PublicFile,
     SourceEntry,
-    classes,
-    lookup,
-    make,
-    resolve,
 )
+from retwin.catalog.modules import import_beside
+from retwin.checks import one_of
 
-__all__ = [
-    "CALIBRATE_ON",
-    "CANDIDATES",
-    "CASES",
-    "CLASSIFIERS",
-    "CORRECTIONS",
-    "DENSITIES",
-    "DIAGNOSERS",
-    "DOWNLOADS",
-    "EXTRAS",
-    "FORMATS",
-    "IDENTIFICATIONS",
-    "LOGS",
-    "METRICS",
-    "NEEDS",
-    "NETWORKS",
-    "OPENED_CASE",
-    "PRESETS",
-    "SOURCES",
-    "SURROGATE_MODES",
-    "TWINS",
-    "CaseEntry",
-    "Entry",
-    "Extra",
-    "FormatEntry",
-    "LogEntry",
-    "Metric",
-    "Need",
-    "PublicFile",
-    "SourceEntry",
-    "classes",
-    "lookup",
-    "make",
-    "metrics_with",
-    "resolve",
-]
+T = TypeVar("T")
 
 OPENED_CASE = "retwin.cases:get"
 """The function from the name of a case to the case, for models that name the case of their twin."""
 CASES: Mapping[str, CaseEntry] = {
     name: CaseEntry(
-        f"retwin.cases.{room}.case:{name}", title, f"retwin.cases.{room}.recorded:RECORDED"
+        f"retwin.cases.{room}.case:{name}", title, f"retwin.cases.{room}.{recorded}:RECORDED"
     )
-    for name, room, title in (
-        ("armpi", "armpi_fpv", "ArmPi FPV robot arm"),
-        ("tanks", "cascaded_tanks", "two cascaded tanks, without overflow"),
-        ("tanks_overflow", "cascaded_tanks", "two cascaded tanks that overflow"),
-        ("silverbox", "silver_box", "Silverbox, a linear twin of a cubic spring"),
-        ("incubator", "styrofoam_incubator", "incubator, a heater in a box of styrofoam"),
+    for name, room, recorded, title in (
+        ("armpi", "armpi_fpv", "recorded", "ArmPi FPV robot arm"),
+        ("tanks", "cascaded_tanks", "twin", "two cascaded tanks, without overflow"),
+        ("tanks_overflow", "cascaded_tanks", "twin", "two cascaded tanks that overflow"),
+        ("silverbox", "silver_box", "twin", "Silverbox, a linear twin of a cubic spring"),
+        ("incubator", "styrofoam_incubator", "twin", "incubator, a heater in a box of styrofoam"),
     )
 }
 """The built-in cases, by the names that `retwin.cases.get` and the command line take."""
@@ -264,7 +232,7 @@ DOWNLOADS: Mapping[str, PublicFile] = {
         "HEAD/mydataset/my_dataset_test.mat",
         sha256="5d87fcdba86f6000dee5b7ec31a6e9a72276a9c4ff0b3a67d39a821cc5931b67",
         file="armpi/my_dataset_test.mat",
-    ),
+    )
 }
 """Public files by the names of their cases, which `retwin.data.fetch` takes."""
 
@@ -285,116 +253,114 @@ NEEDS: Mapping[Need, Sequence[Need]] = {
 }
 """The jobs that must be done before those that sources need."""
 
-_BY = "retwin.study.sources:"
-"""The module of the functions by which a source is made."""
+
+def _source(
+    title: str,
+    real_data: str,
+    *needs: Need,
+    twin: str = "",
+    diagnoser: str = "",
+    marks: str = "",
+    **others: Any,
+) -> SourceEntry:
+    """A source that a function of `retwin.study.sources` makes; `marks` are its true fields."""
+    made = {"twin": twin, "diagnoser": diagnoser}
+    others |= {kind: f"retwin.study.sources:{name}" for kind, name in made.items() if name}
+    others |= dict.fromkeys(marks.split(), True)
+    return SourceEntry(title, real_data, needs, **others)
+
+
 SOURCES: Mapping[str, SourceEntry] = {
-    "dt": SourceEntry(
-        "Original twin", "none", diagnoser=_BY + "recorded_twin", recorded=True, role="plain"
+    "dt": _source(
+        "Original twin", "none", diagnoser="recorded_twin", marks="recorded", role="plain"
     ),
-    "twin": SourceEntry(
-        "Original twin", "none", twin=_BY + "plain_twin", simulates=True, role="plain"
+    "twin": _source("Original twin", "none", twin="plain_twin", marks="simulates", role="plain"),
+    "randomised": _source("Randomised twin", "none", twin="randomised_twin", marks="parametric"),
+    "ibg": _source(
+        "Surrogate only", "timing", _SURROGATE, twin="surrogate_alone", role="surrogate"
     ),
-    "randomised": SourceEntry(
-        "Randomised twin", "none", twin=_BY + "randomised_twin", parametric=True
+    "dt_noise": _source(
+        "Surrogate with output noise", "healthy", _SURROGATE, twin="noisy_surrogate"
     ),
-    "ibg": SourceEntry(
-        "Surrogate only", "timing", (_SURROGATE,), twin=_BY + "surrogate_alone", role="surrogate"
-    ),
-    "dt_noise": SourceEntry(
-        "Surrogate with output noise", "healthy", (_SURROGATE,), twin=_BY + "noisy_surrogate"
-    ),
-    "pi_ls": SourceEntry(
+    "pi_ls": _source(
         "Identified twin (least squares)",
         "healthy",
-        (_LEAST_SQUARES,),
-        twin=_BY + "updated",
-        parametric=True,
+        _LEAST_SQUARES,
+        twin="updated",
+        marks="parametric",
     ),
-    "pi_bayes": SourceEntry(
+    "pi_bayes": _source(
         "Identified twin (Bayesian)",
         "healthy",
-        (_BAYES,),
-        twin=_BY + "updated",
-        parametric=True,
+        _BAYES,
+        twin="updated",
+        marks="parametric",
         extra="bayes",
     ),
-    "dann": SourceEntry(
+    "dann": _source(
         "Domain-adversarial network",
         "unlabelled",
-        diagnoser=_BY + "adversarial",
-        recorded=True,
-        network=True,
+        diagnoser="adversarial",
+        marks="recorded network",
     ),
-    "dann_transductive": SourceEntry(
+    "dann_transductive": _source(
         "Domain-adversarial network (uses test outputs)",
         "transductive",
-        diagnoser=_BY + "adversarial_transductive",
-        recorded=True,
-        network=True,
+        diagnoser="adversarial_transductive",
+        marks="recorded network",
     ),
-    "mean_corrected": SourceEntry(
-        "Updated twin (mean only)", "healthy", (_SURROGATE, _OUTPUT), twin=_BY + "mean_corrected"
+    "mean_corrected": _source(
+        "Updated twin (mean only)", "healthy", _SURROGATE, _OUTPUT, twin="mean_corrected"
     ),
-    "ibg_rg": SourceEntry(
+    "ibg_rg": _source(
         "Updated twin (outputs)",
         "healthy",
-        (_SURROGATE, _OUTPUT),
-        twin=_BY + "output_corrected",
+        _SURROGATE,
+        _OUTPUT,
+        twin="output_corrected",
         role="updated",
     ),
-    "pi_ls_rg": SourceEntry(
+    "pi_ls_rg": _source(
         "Identified, then updated twin (outputs)",
         "healthy",
-        (_IDENTIFIED, _IDENTIFIED_OUTPUT),
-        twin=_BY + "identified_corrected",
-        parametric=True,
-        simulates=True,
+        _IDENTIFIED,
+        _IDENTIFIED_OUTPUT,
+        twin="identified_corrected",
+        marks="parametric simulates",
     ),
-    "dynamics": SourceEntry(
-        "Updated twin (dynamics)", "healthy", (_DYNAMICS,), twin=_BY + "updated"
-    ),
-    "fit": SourceEntry(
-        "Updated twin (chosen by its calibration)",
-        "healthy",
-        (("update", "fit"),),
-        twin=_BY + "updated",
-        simulates=True,
-    ),
+    "dynamics": _source("Updated twin (dynamics)", "healthy", _DYNAMICS, twin="updated"),
     **{
-        name: SourceEntry(
-            title, "healthy", (("update", name),), twin=_BY + "updated", simulates=True
-        )
+        name: _source(title, "healthy", ("update", name), twin="updated", marks="simulates")
         for name, title in (
+            ("fit", "Updated twin (chosen by its calibration)"),
             ("arx", "Linear model (ARX)"),
             ("narx", "Polynomial model (NARX)"),
             ("neural_ss", "Neural state-space model"),
             ("lstm", "LSTM"),
         )
     },
-    "ibg_rg_command": SourceEntry(
+    "ibg_rg_command": _source(
         "Updated twin (command space)",
         "healthy",
-        (_SURROGATE, _COMMAND),
-        twin=_BY + "command_corrected",
+        _SURROGATE,
+        _COMMAND,
+        twin="command_corrected",
         role="updated",
     ),
-    "fine_tuned": SourceEntry(
+    "fine_tuned": _source(
         "Classifier fine-tuned on labelled faults",
         "labelled",
-        (_SURROGATE, _COMMAND, ("diagnosis", "ibg_rg_command")),
-        diagnoser=_BY + "fine_tuned",
-        network=True,
+        *(_SURROGATE, _COMMAND, ("diagnosis", "ibg_rg_command")),
+        diagnoser="fine_tuned",
+        marks="network",
     ),
-    "inversion": SourceEntry(
-        "Physics inversion", "healthy", (_SURROGATE, _COMMAND), diagnoser=_BY + "inversion"
+    "inversion": _source(
+        "Physics inversion", "healthy", _SURROGATE, _COMMAND, diagnoser="inversion"
     ),
-    "inversion_dynamics": SourceEntry(
-        "Physics inversion (dynamics)",
-        "healthy",
-        (_DYNAMICS,),
-        diagnoser=_BY + "inversion_dynamics",
+    "inversion_dynamics": _source(
+        "Physics inversion (dynamics)", "healthy", _DYNAMICS, diagnoser="inversion_dynamics"
     ),
-    "inversion_cnn": SourceEntry(
+    "inversion_cnn": _source(
         "Physics inversion with classifier", "healthy", pool=("inversion", "ibg_rg_command")
     ),
 }
@@ -409,52 +375,32 @@ PRESETS: Mapping[str, Entry] = {
 }
 """Classifier, training and number of runs of a study."""
 
+
+def _metric(title: str, marks: str = "", better: int = 1, **others: Any) -> Metric:
+    """A score; `marks` are its true fields."""
+    others |= dict.fromkeys(marks.split(), True)
+    return Metric(title, better, **others)
+
+
+_ALL = "headline compared family"
 METRICS: Mapping[str, Metric] = {
-    "macro_f1": Metric(
-        "Macro-F1", headline=True, head="macro-F1", selected=True, compared=True, family=True
+    "macro_f1": _metric("Macro-F1", f"{_ALL} selected", head="macro-F1"),
+    "balanced_accuracy": _metric("Balanced accuracy", _ALL, head="balanced\nacc."),
+    "auroc": _metric("Macro AUROC", _ALL, head="macro\nAUROC"),
+    "healthy_recall": _metric(
+        "Healthy recall", "headline selected compared", head="healthy\nrecall"
     ),
-    "balanced_accuracy": Metric(
-        "Balanced accuracy", headline=True, head="balanced\nacc.", compared=True, family=True
-    ),
-    "auroc": Metric("Macro AUROC", headline=True, head="macro\nAUROC", compared=True, family=True),
-    "healthy_recall": Metric(
-        "Healthy recall", headline=True, head="healthy\nrecall", selected=True, compared=True
-    ),
-    "accuracy": Metric("Accuracy", compared=True),
-    "auroc_micro": Metric("Micro AUROC"),
-    "ece": Metric("ECE", -1),
-    "ece_classwise": Metric("Class-wise ECE", -1),
-    "rmse": Metric(
-        "RMSE",
-        -1,
-        headline=True,
-        unit="output",
-        head="RMSE",
-        selected=True,
-        simulated=True,
-        compared=True,
-        family=True,
-    ),
-    "nrmse": Metric("NRMSE", -1, headline=True, head="NRMSE", simulated=True, compared=True),
-    "crps": Metric(
-        "CRPS",
-        -1,
-        headline=True,
-        unit="output",
-        head="CRPS",
-        simulated=True,
-        compared=True,
-        family=True,
-    ),
-    "nll": Metric("NLL", -1, headline=True, head="NLL", simulated=True),
-    "coverage50": Metric("Coverage of the 50 % band", 0, simulated=True),
-    "coverage90": Metric(
-        "Coverage of the 90 % band",
-        0,
-        headline=True,
-        head="in 90 %\nband",
-        selected=True,
-        simulated=True,
+    "accuracy": _metric("Accuracy", "compared"),
+    "auroc_micro": _metric("Micro AUROC"),
+    "ece": _metric("ECE", "", -1),
+    "ece_classwise": _metric("Class-wise ECE", "", -1),
+    "rmse": _metric("RMSE", f"{_ALL} selected simulated", -1, unit="output", head="RMSE"),
+    "nrmse": _metric("NRMSE", "headline simulated compared", -1, head="NRMSE"),
+    "crps": _metric("CRPS", f"{_ALL} simulated", -1, unit="output", head="CRPS"),
+    "nll": _metric("NLL", "headline simulated", -1, head="NLL"),
+    "coverage50": _metric("Coverage of the 50 % band", "simulated", 0),
+    "coverage90": _metric(
+        "Coverage of the 90 % band", "headline selected simulated", 0, head="in 90 %\nband"
     ),
 }
 """Scores of diagnoses, and of simulations, in the order in which they are shown."""
@@ -467,3 +413,55 @@ def metrics_with(*marks: str, simulated: bool) -> tuple[str, ...]:
         for name, each in METRICS.items()
         if each.simulated == simulated and all(getattr(each, mark) for mark in marks)
     )
+
+
+def resolve(target: str) -> Any:
+    """The object that "package.module:object" names, installed or in the current folder.
+
+    Raises
+    ------
+    ImportError, AttributeError
+        There is no such module or object; for each entry of the catalog there is one.
+
+    """
+    module, _, attribute = target.partition(":")
+    return getattr(import_beside(module, Path.cwd()), attribute)
+
+
+def lookup(entries: Mapping[str, T], name: str, argument: str) -> T:
+    """The entry of that name.
+
+    Raises
+    ------
+    InputError
+        There is none; the message names `argument`.
+
+    """
+    return entries[one_of(argument, name, entries)]
+
+
+def make(entries: Mapping[str, Entry], name: str, argument: str) -> Any:
+    """The result of the target of that entry, called without arguments.
+
+    Raises
+    ------
+    InputError
+        There is no entry of that name; the message names `argument`.
+
+    """
+    return resolve(lookup(entries, name, argument).target)()
+
+
+def classes(entries: Mapping[str, Entry], base: type = object) -> tuple[type, ...]:
+    """The config classes of all entries: the kinds that a saved model may name.
+
+    Parameters
+    ----------
+    entries : mapping of str to Entry
+        Entries whose targets are config classes, or functions with `kinds`.
+    base : type
+        Only subclasses of this class, or classes with the methods of this protocol, are returned.
+
+    """
+    targets = [target for each in entries.values() for target in each.kinds or (each.target,)]
+    return tuple(kind for kind in map(resolve, targets) if issubclass(kind, base))

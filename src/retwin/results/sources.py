@@ -57,6 +57,7 @@ class Scored(ResultsPart):
     """
 
     scores: Mapping[str, list[Number] | float] = {}
+    intervals: dict[str, Interval | None] = {}
 
     @model_validator(mode="before")
     @classmethod
@@ -70,6 +71,10 @@ class Scored(ResultsPart):
     def _spread(self, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
         made = handler(self)
         return {**made.pop("scores"), **made}
+
+    def interval(self, metric: str) -> tuple[float, float] | None:
+        """The interval of a metric; None if there is none."""
+        return finite_interval(self.intervals.get(metric))
 
     def runs(self, metric: str) -> list[float]:
         """The values of a metric over runs; empty if there are none."""
@@ -89,9 +94,6 @@ class SourceResults(Scored):
     ----------
     title : str
         The name in tables.
-    intervals : dict of str to Interval
-        The 95 % interval over test trajectories of a metric's mean over the runs at hand; of a
-        study without classes with few records, over other stretches of these.
     confusion : list of list of int
         Counts (true class, predicted class), summed over runs.
     predictions : list of list of int
@@ -112,7 +114,6 @@ class SourceResults(Scored):
 
     """
 
-    intervals: dict[str, Interval | None] = {}
     confusion: list[list[int]] | None = None
     predictions: list[list[int]] | None = None
     fault_protocol_known: bool | None = None
@@ -125,10 +126,6 @@ class SourceResults(Scored):
     predict_s: float | None = None
     twin_runs: int | None = None
     notes: list[str] = []
-
-    def interval(self, metric: str) -> tuple[float, float] | None:
-        """The interval of a metric; None if there is none."""
-        return finite_interval(self.intervals.get(metric))
 
     def generation_seconds(self, trajectories: int) -> float | None:
         """Seconds for so many trajectories, in proportion to the time of those generated."""
@@ -145,7 +142,6 @@ class CurvePoint(Scored):
 
     source: str
     healthy: int
-    intervals: dict[str, Interval | None] = {}
 
     @model_validator(mode="before")
     @classmethod
@@ -161,10 +157,6 @@ class CurvePoint(Scored):
         made = handler(self)
         intervals = {f"{name}_interval": each for name, each in made.pop("intervals").items()}
         return {**made.pop("scores"), **made, **intervals}
-
-    def interval(self, metric: str) -> tuple[float, float] | None:
-        """The interval of a metric; None if there is none."""
-        return finite_interval(self.intervals.get(metric))
 
 
 class Comparison(ResultsPart):

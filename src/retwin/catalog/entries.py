@@ -1,16 +1,9 @@
-"""The kinds of entries of the catalog, and how an entry's implementation is found."""
+"""The kinds of entries of the catalog."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, TypeVar
-
-from retwin.checks import one_of
-from retwin.modules import import_beside
-
-T = TypeVar("T")
 
 Need = tuple[str, str]
 """Kind and name of a job of a study whose result is needed."""
@@ -240,55 +233,3 @@ class PublicFile:
     url: str
     sha256: str
     file: str
-
-
-def resolve(target: str) -> Any:
-    """The object that "package.module:object" names, installed or in the current folder.
-
-    Raises
-    ------
-    ImportError, AttributeError
-        There is no such module or object; for each entry of the catalog there is one.
-
-    """
-    module, _, attribute = target.partition(":")
-    return getattr(import_beside(module, Path.cwd()), attribute)
-
-
-def lookup(entries: Mapping[str, T], name: str, argument: str) -> T:
-    """The entry of that name.
-
-    Raises
-    ------
-    InputError
-        There is none; the message names `argument`.
-
-    """
-    return entries[one_of(argument, name, entries)]
-
-
-def make(entries: Mapping[str, Entry], name: str, argument: str) -> Any:
-    """The result of the target of that entry, called without arguments.
-
-    Raises
-    ------
-    InputError
-        There is no entry of that name; the message names `argument`.
-
-    """
-    return resolve(lookup(entries, name, argument).target)()
-
-
-def classes(entries: Mapping[str, Entry], base: type = object) -> tuple[type, ...]:
-    """The config classes of all entries: the kinds that a saved model may name.
-
-    Parameters
-    ----------
-    entries : mapping of str to Entry
-        Entries whose targets are config classes, or functions with `kinds`.
-    base : type
-        Only subclasses of this class, or classes with the methods of this protocol, are returned.
-
-    """
-    targets = [target for each in entries.values() for target in each.kinds or (each.target,)]
-    return tuple(kind for kind in map(resolve, targets) if issubclass(kind, base))

@@ -1,7 +1,9 @@
 """`results.json` of a study, schema 1: the one model that writes and reads it.
 
-What it states of sources is in `retwin.source_results`. Keys that the model does not have are
+What it states of sources is in `retwin.results.sources`. Keys that the model does not have are
 ignored, so that files of later versions of the schema open.
+
+Belongs here: what study writes and report and command line read. Not here: how it is computed.
 """
 
 from __future__ import annotations
@@ -15,8 +17,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from retwin.checks import require
 from retwin.errors import InputError
-from retwin.serialisation.files import read_json
-from retwin.source_results import (
+from retwin.results.sources import (
     Comparison,
     CurvePoint,
     Interval,
@@ -25,6 +26,7 @@ from retwin.source_results import (
     SourceResults,
     finite_interval,
 )
+from retwin.serialisation.files import read_json, refusing
 
 SCHEMA = 1
 """The version of the schema that every file states under `schema`."""
@@ -330,14 +332,8 @@ def read_results(folder: str | os.PathLike[str]) -> Results:
         got=f"{folder}, which has none",
         remedy=again,
     )
-    try:
+    with refusing("results.json", expected="JSON", remedy=again):
         content = read_json(path)
-    except InputError:
-        raise
-    except (ValueError, OSError) as error:
-        raise InputError(
-            "results.json", expected="JSON", got=f"{path} ({error})", remedy=again
-        ) from error
     schema = content.get("schema") if isinstance(content, dict) else None
     require(
         schema == SCHEMA,

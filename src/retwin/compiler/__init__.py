@@ -1,4 +1,8 @@
-"""The C compiler: C99 source as functions of arrays."""
+"""The C compiler: C99 source as functions of arrays.
+
+Belongs here: finding a compiler, compiling once per machine, calls. Not here: C source, which lies
+beside the modules that describe the same in torch; `kernel.h` stands above it.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +15,21 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.resources import files
 from importlib.util import find_spec
 from itertools import pairwise, product
 from pathlib import Path
+from typing import TypeVar
 
 from numpy.typing import NDArray
 
+from retwin.errors import brief
 from retwin.workers.threads import available, in_threads
 
+T = TypeVar("T")
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction and reassociation, results are those of torch up to single roundings."""
 NATIVE = "-march=native"
@@ -49,13 +56,29 @@ def compilers() -> Iterator[list[str]]:
         yield [sys.executable, "-m", "ziglang", "cc"]
 
 
+def try_compilers(
+    make: Callable[[tuple[str, ...]], T], *flags: Sequence[str]
+) -> tuple[T | None, str]:
+    """What `make` returns for the first compiler and flags with which it raises no OSError.
+
+    Without one, None, and the reasons of all.
+    """
+    reasons = []
+    for command, own in product(compilers(), flags):
+        try:
+            return make((*command, *own)), ""
+        except OSError as error:
+            reasons.append(f"{command[0]}: {brief(error)}")
+    return None, "; ".join(reasons)
+
+
 @lru_cache(maxsize=COMPILED)
 def compiled_files(package: str, *names: str, contract: bool = False) -> ctypes.CDLL | None:
     """The functions of C files in a package, compiled together; None without a C compiler.
 
     The files need no declarations: `kernel.h` stands above them. `contract` is that of `compiled`.
     """
-    source = c_source("retwin", "kernel.h") + c_source(package, *names)
+    source = c_source(__package__, "kernel.h") + c_source(package, *names)
     return compiled(source, contract=contract, quiet=True)
 
 
@@ -81,20 +104,15 @@ def compiled(source: str, *, contract: bool = False, quiet: bool = False) -> cty
         The loaded library, kept for as long as this process needs it.
 
     """
-    reasons = []
     flags = [*FLAGS, "-ffp-contract=fast"] if contract else [*FLAGS]
-    for command, native in product(compilers(), ([NATIVE], [])):
-        try:
-            return _library(source, (*command, *flags, *native))
-        except OSError as error:
-            reasons.append(f"{command[0]}: {error}")
-    if not quiet:
+    made, reasons = try_compilers(partial(_library, source), [*flags, NATIVE], flags)
+    if made is None and not quiet:
         warnings.warn(
             "the model runs in torch, some thousand times slower, since there is no C compiler "
-            f"({'; '.join(reasons) or 'none is installed'}); install one, or retwin[compiled]",
+            f"({reasons or 'none is installed'}); install one, or retwin[compiled]",
             stacklevel=2,
         )
-    return None
+    return made
 
 
 def build(command: Sequence[str], source: Path, library: Path) -> None:
