@@ -41,64 +41,58 @@ DEMO_MINUTES = 3
 """Minutes that a run of the demo takes at most on two cores, as measured."""
 COMPARED = {"a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict"}
 """What is printed of a comparison as JSON."""
-StudyFolder = Annotated[Path, option("FOLDER", "Called again, the study goes on there.")]
-RealSet = Annotated[Path | None, option("FILE", "One real set, split into --folds.")]
 Folds = Annotated[int, option("N", "Folds of --real.")]
-CalibrationSet = Annotated[Path | None, option("FILE", "Or one to calibrate on, and --test.")]
-TestSet = Annotated[Path | None, option("FILE", "One to test on.")]
-OneFile = Annotated[Path | None, option("FILE", "Or one file that the case splits.")]
-TwinSet = Annotated[Path | None, option("FILE", "Trajectories of the twin; else simulated.")]
-Sources = Annotated[
-    str | None,
-    option(
-        "NAMES",
-        "Joined by commas, or all; else dt (or twin), ibg, ibg_rg.",
-        autocompletion=complete_sources,
-    ),
-]
-Preset = Annotated[
-    str,
-    option("NAME", "quick or paper: classifier, training, runs.", names=catalog.PRESETS),
-]
-Classifier = Annotated[
-    str | None,
-    rare("NAME", "cnn, lstm or rocket; else the preset's.", names=catalog.CLASSIFIERS),
-]
 Runs = Annotated[int | None, option("N", "Runs; else the preset's.")]
 Rate = Annotated[float | None, rare("HZ", "Rate of the features; else the sensor's.")]
-PerClass = Annotated[int | None, option("N", "Generated trajectories; else the case's.")]
-CalibrateOn = Annotated[str, rare("NAME", "healthy or all.", names=catalog.CALIBRATE_ON)]
-RandomOnset = Annotated[bool, rare("", "Draw the onset of stuck motors.", "--random-onset")]
-EncoderNoise = Annotated[float, rare("X", "Noise on frozen joints, in command units.")]
-LearningCurve = Annotated[
-    bool, rare("", "Also calibrate on 1, 2, 4, 6 … healthy ones.", "--learning-curve")
-]
-Processes = Annotated[int | None, rare("N", "Jobs at a time; else one per core.")]
 
 
 def study(
     case: CaseArgument,
-    out: StudyFolder,
-    real: RealSet = None,
+    out: Annotated[Path, option("FOLDER", "Called again, the study goes on there.")],
+    real: Annotated[Path | None, option("FILE", "One real set, split into --folds.")] = None,
     folds: Folds = 3,
-    calibration: CalibrationSet = None,
-    test: TestSet = None,
-    data: OneFile = None,
-    twin_data: TwinSet = None,
+    calibration: Annotated[
+        Path | None, option("FILE", "Or one to calibrate on, and --test.")
+    ] = None,
+    test: Annotated[Path | None, option("FILE", "One to test on.")] = None,
+    data: Annotated[Path | None, option("FILE", "Or one file that the case splits.")] = None,
+    twin_data: Annotated[
+        Path | None, option("FILE", "Trajectories of the twin; else simulated.")
+    ] = None,
     mapping: LogMapping = None,
-    sources: Sources = None,
-    preset: Preset = "quick",
+    sources: Annotated[
+        str | None,
+        option(
+            "NAMES",
+            "Joined by commas, or all; else dt (or twin), ibg, ibg_rg.",
+            autocompletion=complete_sources,
+        ),
+    ] = None,
+    preset: Annotated[
+        str, option("NAME", "quick or paper: classifier, training, runs.", names=catalog.PRESETS)
+    ] = "quick",
     runs: Runs = None,
-    per_class: PerClass = None,
+    per_class: Annotated[
+        int | None, option("N", "Generated trajectories; else the case's.")
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
-    classifier: Classifier = None,
+    classifier: Annotated[
+        str | None,
+        rare("NAME", "cnn, lstm or rocket; else the preset's.", names=catalog.CLASSIFIERS),
+    ] = None,
     rate: Rate = None,
-    calibrate_on: CalibrateOn = "healthy",
-    random_onset: RandomOnset = False,
-    encoder_noise: EncoderNoise = 0.0,
-    learning_curve: LearningCurve = False,
-    processes: Processes = None,
+    calibrate_on: Annotated[
+        str, rare("NAME", "healthy or all.", names=catalog.CALIBRATE_ON)
+    ] = "healthy",
+    random_onset: Annotated[
+        bool, rare("", "Draw the onset of stuck motors.", "--random-onset")
+    ] = False,
+    encoder_noise: Annotated[float, rare("X", "Noise on frozen joints, in command units.")] = 0.0,
+    learning_curve: Annotated[
+        bool, rare("", "Also calibrate on 1, 2, 4, 6 … healthy ones.", "--learning-curve")
+    ] = False,
+    processes: Annotated[int | None, rare("N", "Jobs at a time; else one per core.")] = None,
     scheduler: Scheduler = None,
 ) -> None:
     """Compare updated twins with other sources on real trajectories."""

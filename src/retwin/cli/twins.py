@@ -48,17 +48,8 @@ if TYPE_CHECKING:
     from retwin.twins.limits import Limits
     from retwin.twins.twin import Twin
 
-app = Commands(
-    help="List, describe and simulate twins.",
-    epilog=example("retwin twin info armpi"),
-)
+app = Commands(help="List, describe and simulate twins.", epilog=example("retwin twin info armpi"))
 
-TwinName = Annotated[
-    str,
-    argument(
-        "TWIN", "See `retwin twin info`; or a saved model's folder.", autocompletion=complete_twins
-    ),
-]
 Rate = Annotated[float | None, rare("HZ", "Samples per second.", min=1e-9)]
 
 RAMPS = 5
@@ -67,15 +58,6 @@ NoMeshes = Annotated[bool, rare("", "Leave out the meshes of a model file.", "--
 Servos = Annotated[
     list[str] | None, rare("JOINT=K,D", "Servo of a URDF's joint; repeatable.", "--servo")
 ]
-Count = Annotated[int | None, option("N", "Else one per command or class.", "--n")]
-CommandCase = Annotated[
-    str | None, option("CASE", "Draws commands and faults; else its own.", names=CASES)
-]
-CommandFile = Annotated[Path | None, option("FILE", "Trajectories with the commands.")]
-FaultName = Annotated[
-    str, option("NAME", "A class, all (in turn), or none.", autocompletion=complete_faults)
-]
-Duration = Annotated[float | None, rare("SECONDS", "Of commands that no case draws.", min=1e-9)]
 
 SHOWN = 100
 """Largest number of channels in a table: one of thousands takes minutes to lay out."""
@@ -91,8 +73,7 @@ OTHERS = {
 @app.command(epilog=example("retwin twin info armpi"))
 def info(
     twin: Annotated[
-        str | None,
-        argument("TWIN", "Else all are listed.", autocompletion=complete_twins),
+        str | None, argument("TWIN", "Else all are listed.", autocompletion=complete_twins)
     ] = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
@@ -167,19 +148,32 @@ def _ends(channel: dict[str, Any]) -> tuple[str, str]:
 
 @app.command(epilog=example("retwin twin simulate armpi --n 20000 --fault all --out made.zarr"))
 def simulate(
-    twin: TwinName,
+    twin: Annotated[
+        str,
+        argument(
+            "TWIN",
+            "See `retwin twin info`; or a saved model's folder.",
+            autocompletion=complete_twins,
+        ),
+    ],
     out: Annotated[Path | None, option("FILE", "New *.npz, or *.zarr of any size.")] = None,
-    n: Count = None,
-    case: CommandCase = None,
-    commands: CommandFile = None,
-    fault: FaultName = "none",
+    n: Annotated[int | None, option("N", "Else one per command or class.", "--n")] = None,
+    case: Annotated[
+        str | None, option("CASE", "Draws commands and faults; else its own.", names=CASES)
+    ] = None,
+    commands: Annotated[Path | None, option("FILE", "Trajectories with the commands.")] = None,
+    fault: Annotated[
+        str, option("NAME", "A class, all (in turn), or none.", autocompletion=complete_faults)
+    ] = "none",
     seed: Seed = 0,
     film: Film = None,
     name: FilmedId = None,
     fps: FramesPerSecond = None,
     size: FilmSize = None,
     renderer: Renderer = None,
-    duration: Duration = None,
+    duration: Annotated[
+        float | None, rare("SECONDS", "Of commands that no case draws.", min=1e-9)
+    ] = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
