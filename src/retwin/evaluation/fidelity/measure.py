@@ -112,10 +112,6 @@ def measure_fidelity(
         name: tuple(map(np.array, zip(*(row[f"rival/{name}"] for row in rows), strict=True)))
         for name in against
     }
-    names = (
-        *("nominal", "observed", "seen", "bands", "crps", "energy", "pit", "features"),
-        "segment_values",
-    )
     return Fidelity(
         outputs=trajectories.outputs,
         segment_channels=_segment_channels(twin, trajectories.rate),
@@ -125,7 +121,7 @@ def measure_fidelity(
         rivals=rivals,
         widening=np.full(len(trajectories), np.nan if widening is None else widening),
         at_bound=np.full(len(trajectories), _at_bound(twin)),
-        **{name: np.stack([row[name] for row in rows]) for name in names},
+        **{name: np.stack([row[name] for row in rows]) for name in rows[0] if "rival/" not in name},
     )
 
 

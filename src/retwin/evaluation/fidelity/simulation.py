@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,10 +71,10 @@ class Simulation(StoredArrays):
     @classmethod
     def joined(cls, parts: Sequence[Simulation], ids: NDArray) -> Simulation:
         """Simulations of several folds as one, in the order of `ids`."""
-        names = np.concatenate([part.ids for part in parts]).tolist()
+        every = cls.concatenate(parts)
+        names = every.ids.tolist()
         order = [names.index(name) for name in ids.tolist()]
-        arrays = ([getattr(part, each.name) for part in parts] for each in fields(cls))
-        return cls(*(np.concatenate(each)[order] for each in arrays))
+        return cls(*(each[order] for each in vars(every).values()))
 
 
 @checked_once
