@@ -216,7 +216,7 @@ def read_signals(files: Sequence[Path], max_bytes: int | None = None) -> Traject
         zeros = partial(lambda row, u: np.tile(row, (*u.shape[:2], 1)), nothing)
         twin = FunctionTwin(zeros, rate=rate, inputs=Channels((), ()), outputs=channels)
         found = reader.trajectories(files, twin).trajectories
-        seen = np.where(found.mask, found.observed, np.nan)
+        seen = found.measured
         low, high = np.nanmin(seen, axis=(0, 1)), np.nanmax(seen, axis=(0, 1))
         fixed = [n for n, least, most in zip(names, low, high, strict=True) if least == most]
         if not fixed or len(fixed) == len(names):

@@ -199,7 +199,7 @@ class SimulatedRecords:
         found = {
             "commands": self._records.commands,
             "nominal": self._records.nominal,
-            "observed": np.where(self._records.mask, self._records.observed, np.nan),
+            "observed": self._records.measured,
         }
         for name in self.work.plan.sources:
             first = self._runs(name)[0]
@@ -219,7 +219,7 @@ class SimulatedRecords:
         real, ends = self.work.files.real_data(), []
         for calibration, _ in self.work.roles.folds:
             own = real[list(calibration)]
-            both = [own.commands, np.where(own.mask, own.observed, np.nan)]
+            both = [own.commands, own.measured]
             flat = np.concatenate(both, axis=2).reshape(-1, sum(each.shape[2] for each in both))
             ends.append([np.fmin.reduce(flat), np.fmax.reduce(flat)])
         low, high = np.moveaxis(np.array(ends), 1, 0)

@@ -111,7 +111,7 @@ def simulate_records(
     """
     once = getattr(twin, "deterministic", False)
     seeds = np.random.SeedSequence(seed).generate_state(len(records)).tolist()
-    measured = np.where(records.mask, records.observed, np.nan).astype(np.float64)
+    measured = records.measured.astype(np.float64)
     means, bands, scores, densities = [], [], [], []
     for i, twin_seed in tracked(enumerate(seeds), len(seeds), progress):
         commands = np.repeat(records.commands[[i]], 1 if once else draws, axis=0)
@@ -152,7 +152,7 @@ def simulation_scores(means: NDArray, records: Trajectories) -> dict[str, NDArra
         per sample.
 
     """
-    observed = np.where(records.mask, records.observed, np.nan)
+    observed = records.measured
     deviation = np.nanstd(observed.astype(float), axis=(0, 1))
     comparable = 1.0 if records.outputs.comparable else np.nan
     square, score, half, wide, density = np.moveaxis(means, -1, 0)
