@@ -7,17 +7,7 @@ from typing import Annotated
 
 from retwin.checks import require
 from retwin.cli.commands import Commands
-from retwin.cli.options import (
-    Json,
-    LogMapping,
-    MaxBytes,
-    Model,
-    OtherCase,
-    Real,
-    Seed,
-    argument,
-    option,
-)
+from retwin.cli.options import Json, LogMapping, MaxBytes, Model, OtherCase, Seed, argument, option
 from retwin.cli.reading import read, saved, updated_twin
 from retwin.cli.terminal import answer, bar, command_given, example, note, table
 from retwin.serialisation.places import check_place
@@ -31,7 +21,7 @@ app = Commands(
 @app.command(epilog=example("retwin bundle save model real.mat --diagnoser cnn --out bundle"))
 def save(
     model: Model,
-    real: Real,
+    real: Annotated[Path, argument("REAL", "The trajectories it was calibrated on.")],
     out: Annotated[Path, option("FOLDER", "Where to save the bundle.")],
     diagnoser: Annotated[Path | None, option("FOLDER", "Folder of a diagnoser.")] = None,
     case: OtherCase = None,

@@ -260,29 +260,28 @@ def _seen(made: Proposal) -> Table:
     return table(head, rows, numbers=head[2:5])
 
 
+SAMPLING = {
+    "channel": "{channel}",
+    "signal": "{signal}",
+    "Hz": "{rate:.4g}",
+    "resampled": "{method}",
+    "missing": "{missing:.2%}",
+    "bridged s": "{bridged:.3g}",
+    "longest s": "{longest:.3g}",
+    "note": "{note}",
+}
+"""Heads of the table of samplings, and what stands below them."""
+
+
 def _samplings(facts: dict[str, Any]) -> list[Table]:
     """For each log, how its channels came to their samples."""
-    head = ("channel", "signal", "Hz", "resampled", "missing", "bridged s", "longest s", "note")
+    sources = (source["sampling"] for source in facts["provenance"] if "sampling" in source)
+    rows = (
+        [[cell.format(**own) for cell in SAMPLING.values()] for own in each] for each in sources
+    )
     return [
-        table(
-            head,
-            [
-                (
-                    each["channel"],
-                    each["signal"],
-                    f"{each['rate']:.4g}",
-                    each["method"],
-                    f"{each['missing']:.2%}",
-                    f"{each['bridged']:.3g}",
-                    f"{each['longest']:.3g}",
-                    each["note"],
-                )
-                for each in source["sampling"]
-            ],
-            numbers=("Hz", "missing", "bridged s", "longest s"),
-        )
-        for source in facts["provenance"]
-        if "sampling" in source
+        table(tuple(SAMPLING), each, numbers=("Hz", "missing", "bridged s", "longest s"))
+        for each in rows
     ]
 
 

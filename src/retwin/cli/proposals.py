@@ -112,9 +112,7 @@ def _values(made: Proposal, out: Path) -> dict[str, Any]:
     """The result as JSON."""
 
     def listed(points: Any) -> list[dict[str, Any]]:
-        return [
-            {"trajectories": p.trajectories, "excess": p.excess, "recall": p.recall} for p in points
-        ]
+        return [{**vars(point), "recall": point.recall} for point in points]
 
     return {
         "saved": str(out),
@@ -125,5 +123,5 @@ def _values(made: Proposal, out: Path) -> dict[str, Any]:
         "random_gain": made.random_gain,
         "chosen": listed(made.ahead),
         "random": listed(made.ahead_random),
-        "curve": [{"trajectories": p.trajectories, "error": p.error} for p in made.curve],
+        "curve": [vars(point) for point in made.curve],
     }

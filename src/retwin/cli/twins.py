@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from retwin import twins
 from retwin.catalog import CASES, TWINS
 from retwin.checks import agree, given, require
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_faults, complete_twins
-from retwin.cli.films import (
-    Film,
-    FilmedId,
-    FilmSize,
-    FramesPerSecond,
-    Renderer,
-    draw_film,
-    film_settings,
-)
+from retwin.cli.films import draw_film, film_settings
 from retwin.cli.options import (
     Inputs,
     Json,
@@ -166,11 +158,17 @@ def simulate(
         str, option("NAME", "A class, all (in turn), or none.", autocompletion=complete_faults)
     ] = "none",
     seed: Seed = 0,
-    film: Film = None,
-    name: FilmedId = None,
-    fps: FramesPerSecond = None,
-    size: FilmSize = None,
-    renderer: Renderer = None,
+    film: Annotated[
+        Path | None, option("FILE", "Film of --out, else of --commands: *.mp4 or *.gif.")
+    ] = None,
+    name: Annotated[
+        str | None, rare("ID", "The filmed trajectory; else the first.", "--id")
+    ] = None,
+    fps: Annotated[float | None, rare("HZ", "Pictures of the film per second; else 25.")] = None,
+    size: Annotated[str | None, rare("WxH", "Of the film; else 640x480.")] = None,
+    renderer: Annotated[
+        Literal["mujoco", "stick"] | None, rare("", "What draws; else the best here.")
+    ] = None,
     duration: Annotated[
         float | None, rare("SECONDS", "Of commands that no case draws.", min=1e-9)
     ] = None,

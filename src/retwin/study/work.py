@@ -252,9 +252,9 @@ class Work:
             base = stand_in(twin, trial.healthy, how, seed=seed, progress=progress).twin
             if trial.job.name == "fit":
                 settings, original = Choice.of(case), twin if isinstance(base, Surrogate) else None
-                found = fit(base, trial.healthy, settings, seed=seed, original=original)
-                found.twin.save(path)
-                return {"notes": f"chosen: {CANDIDATES[found.chosen]}"}
+                taken = fit(base, trial.healthy, settings, seed=seed, original=original)
+                taken.twin.save(path)
+                return {"notes": f"chosen: {CANDIDATES[taken.chosen]}"}
             made = fit_dynamics(
                 base,  # type: ignore[arg-type]  # it has state equations
                 trial.healthy,
@@ -264,8 +264,13 @@ class Work:
             made.twin.save(path)
             write_estimates(path, made)
             return {"notes": made.reason}
-        bayes = trial.job.name == "pi_bayes"
-        found = _bayes(trial, path) if bayes else _least_squares(trial, path)
+        found: Updated | Posterior
+        if trial.job.name == "pi_bayes":
+            found = identify(trial.parametric, trial.healthy, NPE(), **trial.updating)
+            found.twin.save(path)
+        else:
+            found = updated = identify(trial.parametric, trial.healthy, **trial.updating)
+            save_model(path, "parameters", {"values": updated.values}, {})
         # A search that was cut off is noted; one that converged is no failure.
         cut_off = [each for each in found.reason.split("; ") if "exceeded" in each]
         return {"twin_runs": found.twin_runs, "notes": "; ".join(cut_off)}
@@ -403,18 +408,6 @@ class Work:
 
     def _calibration(self, trial: Trial) -> Trajectories:
         return trial.labelled if self._uses_labels else trial.healthy
-
-
-def _least_squares(trial: Trial, path: Path) -> Updated:
-    found = identify(trial.parametric, trial.healthy, **trial.updating)
-    save_model(path, "parameters", {"values": found.values}, {})
-    return found
-
-
-def _bayes(trial: Trial, path: Path) -> Posterior:
-    found = identify(trial.parametric, trial.healthy, NPE(), **trial.updating)
-    found.twin.save(path)
-    return found
 
 
 def _source_twin(trial: Trial) -> Any:

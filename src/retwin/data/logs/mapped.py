@@ -84,7 +84,35 @@ def mapped(
 
     """
     found = parts_of(log, mapping, budget=budget, case=case, rate=rate)
-    return _finish(log, found.raws(log, mapping.label), found, case, budget)
+    raws = found.raws(log, mapping.label)
+    inputs, outputs = (
+        Channels(tuple(each.name for each in some), tuple(each.unit for each in some))
+        for some in (found.commands, found.measured)
+    )
+    made = assemble(
+        raws,
+        source=Provenance(log.name, log.sha256),
+        case=None,
+        rate=found.rate,
+        budget=budget,
+        inputs=inputs if len(inputs) else None,
+    )
+    notes = found.notes(log)
+    twin = getattr(case, "twin", None)
+    nominal = made.nominal
+    if found.ideal:
+        notes.append("nominal outputs from the log")
+    elif twin is not None and found.commands:
+        nominal = twin.simulate(made.commands, seed=0).nominal
+        notes.append("nominal outputs simulated by the twin of the case")
+    else:
+        notes.append(NO_NOMINAL)
+    sampling = tuple(
+        each.sampling(found.rate, missing)
+        for each, missing in zip(found.every, found.missing(), strict=True)
+    )
+    source = Provenance(log.name, log.sha256, sampling, tuple(notes))
+    return made.replace(nominal=nominal, outputs=outputs, provenance=(source,))
 
 
 def parts_of(
@@ -255,44 +283,6 @@ class Parts:
             for note in each.notes:
                 channels.setdefault(note, []).append(each.name)
         return [f"{', '.join(own)}: {note}" for note, own in channels.items()]
-
-
-def _finish(
-    log: Log,
-    raws: Sequence[Raw],
-    found: Parts,
-    case: DataCase | None,
-    budget: Budget,
-) -> Trajectories:
-    """The trajectories of the parts, with nominal outputs and provenance."""
-    inputs, outputs = (
-        Channels(tuple(each.name for each in some), tuple(each.unit for each in some))
-        for some in (found.commands, found.measured)
-    )
-    made = assemble(
-        raws,
-        source=Provenance(log.name, log.sha256),
-        case=None,
-        rate=found.rate,
-        budget=budget,
-        inputs=inputs if len(inputs) else None,
-    )
-    notes = found.notes(log)
-    twin = getattr(case, "twin", None)
-    nominal = made.nominal
-    if found.ideal:
-        notes.append("nominal outputs from the log")
-    elif twin is not None and found.commands:
-        nominal = twin.simulate(made.commands, seed=0).nominal
-        notes.append("nominal outputs simulated by the twin of the case")
-    else:
-        notes.append(NO_NOMINAL)
-    sampling = tuple(
-        each.sampling(found.rate, missing)
-        for each, missing in zip(found.every, found.missing(), strict=True)
-    )
-    source = Provenance(log.name, log.sha256, sampling, tuple(notes))
-    return made.replace(nominal=nominal, outputs=outputs, provenance=(source,))
 
 
 def _rate(mapping: Mapping, case: DataCase | None, rate: float | None) -> float:
