@@ -185,16 +185,11 @@ def _write_torque(
             history=history,
             progress=lambda share: show("train", share),
         )
-    settings = {
-        "network_file": str(made.network_file),
-        "input_order": made.input_order,
-        "input_idx": list(made.input_idx),
-        "pos_scale": made.pos_scale,
-        "vel_scale": made.vel_scale,
-        "torque_scale": made.torque_scale,
-    }
+    names = ("network_file", "input_order", "input_idx", "pos_scale", "vel_scale", "torque_scale")
+    values = vars(made) | {"input_idx": list(made.input_idx)}
+    settings = {name: values[name] for name in names}
     answer(
-        {**settings, "period": made.period, "unit": made.unit, "error": made.error},
+        settings | values,
         table(("of ActuatorNetMLPCfg", "value"), list(settings.items())),
         f"The simulation must call it every {made.period:g} s. Torques are in {made.unit}; their "
         f"error on held-out simulations of the twin, noise included, is {made.error:.2g} of their "

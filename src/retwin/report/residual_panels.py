@@ -10,12 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
-from retwin.scores.residuals import (
-    autocorrelation,
-    cross_correlation,
-    decorrelated_after,
-    spectra,
-)
+from retwin.scores.residuals import autocorrelation, cross_correlation, decorrelated_after, spectra
 
 POINTS = 241
 """Lags that a figure shows, at most."""

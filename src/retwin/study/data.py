@@ -95,10 +95,7 @@ def real_data(
 
     def read(path: Path) -> Trajectories:
         found = load(
-            path,
-            case=case,
-            progress=lambda share: report(path.name, share),
-            mapping=data.mapping,
+            path, case=case, progress=lambda share: report(path.name, share), mapping=data.mapping
         )
         return _labelled(found, case, path.name)
 

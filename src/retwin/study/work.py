@@ -388,11 +388,7 @@ class Work:
         return name
 
     def _fitted(
-        self,
-        trial: Trial,
-        calibration: Trajectories,
-        name: str,
-        density: Density | SequenceMixture,
+        self, trial: Trial, calibration: Trajectories, name: str, density: Density | SequenceMixture
     ) -> Residual:
         faults: Mapping[str, Fault | None] = self.case.faults
         return fit_residual(

@@ -186,10 +186,7 @@ def assemble(
 
 
 def settle(
-    trajectories: Trajectories,
-    case: DataCase | None,
-    rate: float | None,
-    progress: Progress | None,
+    trajectories: Trajectories, case: DataCase | None, rate: float | None, progress: Progress | None
 ) -> Trajectories:
     """`trajectories` with the channels of `case`, labels checked, commands completed.
 

@@ -92,11 +92,7 @@ class Channel:
 
 
 def table_of(
-    table: Mapping[str, ChannelMapping],
-    wanted: Channels | None,
-    name: str,
-    *,
-    stated: bool = True,
+    table: Mapping[str, ChannelMapping], wanted: Channels | None, name: str, *, stated: bool = True
 ) -> list[tuple[str, ChannelMapping, str | None]]:
     """The channels of a table of the mapping in their order, with the unit that the case has.
 
@@ -136,12 +132,7 @@ def channels_of(
 
 
 def _channel(
-    log: Log,
-    name: str,
-    own: ChannelMapping,
-    unit: str | None,
-    default: Resampling,
-    period: float,
+    log: Log, name: str, own: ChannelMapping, unit: str | None, default: Resampling, period: float
 ) -> Channel:
     found = [signal_of(log, each) for each in own.signals]
     signal, notes = in_order(mean_of(found, log.name), log.name)

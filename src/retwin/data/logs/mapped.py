@@ -41,11 +41,7 @@ def read_mapped(
     settings = mapping if isinstance(mapping, Mapping) else read_mapping(mapping)
     budget = Budget(path.name, max_bytes)
     log = read_log(
-        path,
-        wanted=settings.signals,
-        clock=settings.time.clock,
-        budget=budget,
-        progress=progress,
+        path, wanted=settings.signals, clock=settings.time.clock, budget=budget, progress=progress
     )
     return mapped(log, settings, case=case, rate=rate, budget=budget)
 

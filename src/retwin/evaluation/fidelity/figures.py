@@ -20,12 +20,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Channels
 from retwin.evaluation.fidelity.stored import StoredArrays
-from retwin.scores.distributions import (
-    central_band,
-    cumulative_counts,
-    ks_distance,
-    share_as_far,
-)
+from retwin.scores.distributions import central_band, cumulative_counts, ks_distance, share_as_far
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 
 BINS = 100

@@ -31,11 +31,7 @@ def figures(found: Identification) -> dict[str, Figure]:
         for each in (before, after)
     ]
     shown = [i for i in range(len(measured.outputs)) if measured.mask[..., i].any()][:OUTPUTS]
-    made = [
-        _estimates(found),
-        _records(found, shown),
-        *_residuals(measured, errors, shown),
-    ]
+    made = [_estimates(found), _records(found, shown), *_residuals(measured, errors, shown)]
     return {each.name: each for each in made if each.panels}
 
 
