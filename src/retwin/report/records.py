@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from retwin.data.quality.check import Checked
-from retwin.data.quality.finding import NAMED, Finding
+from retwin.data.quality.finding import NAMED, Finding, group_alike
 from retwin.data.trajectories import Trajectories
 from retwin.report.blocks import Table, tabulate, text_column
 from retwin.report.figure import Figure, Key, Line, Mark, Panel, Spans, record_panel
@@ -45,11 +45,8 @@ def finding_rows(findings: Sequence[Finding]) -> list[tuple[str, str, str, str]]
     Those of one kind in one channel are a row, with the figures of the first; a few with times of
     their own are not.
     """
-    alike: dict[tuple[str, str], list[Finding]] = {}
-    for each in findings:
-        alike.setdefault((each.kind, each.channel), []).append(each)
     rows = []
-    for own in alike.values():
+    for own in group_alike(findings):
         if len(own) == 1 or (own[0].time and len(own) <= NAMED):
             rows += [each.row for each in own]
         else:

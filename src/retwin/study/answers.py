@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, TypeAlias
@@ -206,12 +205,10 @@ class SimulatedRecords:
             found |= {f"{name}/mean": first.mean}
             if first.random:
                 found |= {f"{name}/bands": first.bands}
-        single: Mapping[str, NDArray] = {
-            key: each.astype(np.float32) for key, each in found.items()
-        }
-        about = {"ids": self._records.ids, "rate": np.array(self._records.rate)}
-        about |= {"range": self._range()}
-        made = {f"simulation/{name}": each for name, each in {**single, **about}.items()}
+        made = {f"simulation/{name}": each.astype(np.float32) for name, each in found.items()}
+        made["simulation/ids"] = self._records.ids
+        made["simulation/rate"] = np.array(self._records.rate)
+        made["simulation/range"] = self._range()
         return made | (self._curves() if "dynamics" in self.work.plan.sources else {})
 
     def _range(self) -> NDArray:

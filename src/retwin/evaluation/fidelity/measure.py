@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import require, whole
 from retwin.data.segments import Segments
-from retwin.data.trajectories import Channels, Trajectories
+from retwin.data.trajectories import PER_SAMPLE, Channels, Trajectories
 from retwin.evaluation.fidelity.figures import BINS, Fidelity
 from retwin.evaluation.fidelity.latents import shown_latents
 from retwin.progress import Progress, tracked
@@ -212,16 +212,11 @@ class _Ensemble:
     ) -> _Ensemble:
         """With `draws` simulations by the twin."""
         made = twin.simulate(np.repeat(one.commands, draws, axis=0), seed=seed)
-        members = Trajectories(
-            commands=np.repeat(one.commands, draws + 1, axis=0),
-            nominal=np.repeat(one.nominal, draws + 1, axis=0),
-            observed=np.concatenate([one.observed, made.observed.astype(one.observed.dtype)]),
-            mask=np.repeat(one.mask, draws + 1, axis=0),
-            rate=one.rate,
-            inputs=one.inputs,
-            outputs=one.outputs,
-        )
-        return cls(one, members, stride)
+        repeated = (np.repeat(getattr(one, name), draws + 1, axis=0) for name in PER_SAMPLE)
+        arrays: Any = dict(zip(PER_SAMPLE, repeated, strict=True))
+        arrays["observed"][1:] = made.observed
+        about: Any = {"rate": one.rate, "inputs": one.inputs, "outputs": one.outputs}
+        return cls(one, Trajectories(**arrays, **about), stride)
 
     @property
     def seen(self) -> NDArray:
