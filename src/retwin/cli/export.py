@@ -142,7 +142,9 @@ def actuator(
     check_place(out, folder=not torque)
     twin = updated_twin(model)
     if torque:
-        _write_torque(twin, out, joints, steps, _sampled(twin, model, case, seed), seed, as_json)
+        commands = _sampled(twin, model, case, seed)
+        asked = {"joints": joints, "commands": commands, "seed": seed, "history": steps}
+        _write_torque(twin, out, asked, as_json=as_json)
         return
     from retwin.deploy.actuator.draws import causal_part
     from retwin.deploy.actuator.export import export_actuator
@@ -163,28 +165,12 @@ def actuator(
     _print_actuator(made, out, as_json=as_json)
 
 
-def _write_torque(
-    twin: Any,
-    out: Path,
-    joints: list[Joint],
-    history: tuple[int, ...],
-    commands: NDArray,
-    seed: int,
-    as_json: bool,
-) -> None:
+def _write_torque(twin: Any, out: Path, asked: dict[str, Any], *, as_json: bool) -> None:
     """Write the network of torques, and print the settings with which simulators load it."""
     from retwin.deploy.actuator.torque_net import export_actuator_net
 
     with bar("export") as show:
-        made = export_actuator_net(
-            twin,
-            out,
-            joints=joints,
-            commands=commands,
-            seed=seed,
-            history=history,
-            progress=lambda share: show("train", share),
-        )
+        made = export_actuator_net(twin, out, **asked, progress=lambda share: show("train", share))
     names = ("network_file", "input_order", "input_idx", "pos_scale", "vel_scale", "torque_scale")
     values = vars(made) | {"input_idx": list(made.input_idx)}
     settings = {name: values[name] for name in names}

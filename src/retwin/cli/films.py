@@ -37,7 +37,6 @@ def draw_film(
     twin: Twin,
     system: Case | None,
     settings: dict[str, Any],
-    seed: int,
 ) -> None:
     """Film a trajectory, with the bands of a corrected twin."""
     from retwin.cases.animation import animate
@@ -47,15 +46,8 @@ def draw_film(
     case = given("--case", system, expected, remedy=remedy)
     updated = twin if isinstance(twin, CorrectedTwin | DynamicsTwin) else None
     with bar("film") as show:
-        path = animate(
-            trajectories,
-            case,
-            film,
-            updated=updated,
-            seed=seed,
-            progress=lambda share: show("draw", share),
-            **settings,
-        )
+        settings = {"updated": updated, "progress": lambda share: show("draw", share), **settings}
+        path = animate(trajectories, case, film, **settings)
     answer(path, str(path))
 
 

@@ -51,13 +51,9 @@ def propose(
         nominal = twin.surrogate.predict(made.commands)
     else:
         nominal = twin.simulate(made.commands, seed=seed).nominal
+    nothing = np.full_like(nominal, np.nan)
     commands = rt.Trajectories(
-        made.commands,
-        nominal,
-        np.full_like(nominal, np.nan),
-        twin.rate,
-        inputs=twin.inputs,
-        outputs=twin.outputs,
+        made.commands, nominal, nothing, twin.rate, inputs=twin.inputs, outputs=twin.outputs
     )
     rt.save(commands, out)
     curve = [_curve(made)] if made.curve else []

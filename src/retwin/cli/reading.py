@@ -139,20 +139,11 @@ def read(
         See `rt.load`.
 
     """
-    if isinstance(files, Path):
-        return _read(files, case, rate, part, max_bytes, mapping)
-    sets = [_read(file, case, rate, part, max_bytes, mapping) for file in files]
-    return sets[0] if len(sets) == 1 else Trajectories.concatenate(sets)
-
-
-def _read(
-    file: Path,
-    case: DataCase | str | None,
-    rate: float | None,
-    part: Part,
-    max_bytes: int | None,
-    mapping: Path | None,
-) -> Trajectories:
+    if not isinstance(files, Path):
+        given = {"part": part, "max_bytes": max_bytes, "mapping": mapping}
+        sets = [read(file, case, rate, **given) for file in files]  # type: ignore[arg-type]
+        return sets[0] if len(sets) == 1 else Trajectories.concatenate(sets)
+    file = files
     log = mapping is None and file.exists() and (is_log(file) or file.is_dir())
     if isinstance(case, str):  # a built-in case without torch has no twin to read logs by
         case = case_named(case) if log and not file.is_dir() else data_case(case)

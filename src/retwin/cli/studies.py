@@ -120,7 +120,8 @@ def study(
     if sources == "all":
         plan = replace(plan, sources=possible_sources(system, plan))
     found = StudyData(twin_data, calibration, test, real, data, mapping)
-    _run(system, plan, found, out, processes, scheduler, as_json=as_json)
+    where = {"processes": processes, "scheduler": scheduler}
+    _run(system, plan, found, out, as_json=as_json, **where)
 
 
 def report(
@@ -185,41 +186,19 @@ def demo(
     note("or start with a twin and records of your own: retwin identify --help.")
 
 
-def _run(
-    case: Any,
-    plan: Any,
-    data: Any,
-    out: Path,
-    processes: int | None = None,
-    scheduler: str | None = None,
-    *,
-    as_json: bool,
-) -> None:
+def _run(case: Any, plan: Any, data: Any, out: Path, *, as_json: bool, **where: Any) -> None:
+    """Run a study `where` `run_study` is to run it, write its page, and print what it says."""
     from retwin.report import write_report
     from retwin.study import run_study
 
     with resumable(), bar("study") as show:
-        results = run_study(
-            case,
-            plan,
-            data,
-            out,
-            processes=processes,
-            scheduler=scheduler,
-            report=show,
-            command=command_given(),
-        )
+        given = command_given()
+        results = run_study(case, plan, data, out, report=show, command=given, **where)
         show("report", 0.99)
         page = write_report(out)
         show(FinishedStage("report"), 1.0)
-    answer(
-        _summary(results, page),
-        _title(results),
-        _uses(results),
-        "",
-        _table(results),
-        as_json=as_json,
-    )
+    shown = (_title(results), _uses(results), "", _table(results))
+    answer(_summary(results, page), *shown, as_json=as_json)
     note(f"Report: {page}")
 
 

@@ -212,7 +212,7 @@ def simulate(
         carry_out(plan, out, "simulate", workers=workers, scheduler=scheduler)
     if film is not None and filmed is not None:
         trajectories = read(filmed, system, max_bytes=max_bytes)
-        draw_film(film, trajectories, found, system, settings, seed)
+        draw_film(film, trajectories, found, system, {"seed": seed, **settings})
 
 
 def _twin(
