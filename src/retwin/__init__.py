@@ -73,7 +73,7 @@ _HOME = homes(
         "evaluation": "Choice fit score_model",
         "evaluation.diagnosers": "evaluate",
         "evaluation.experiments.propose": "next_experiments",
-        "evaluation.fidelity": "measure_fidelity",
+        "evaluation.fidelity.measure": "measure_fidelity",
         "nets.networks": "CNN LSTM LSTMClassifier MLP StateSpace TCN",
         "nets.training": "Training",
         "report": "write_report",
@@ -146,7 +146,7 @@ if TYPE_CHECKING:
     from retwin.evaluation import Choice, fit, score_model
     from retwin.evaluation.diagnosers import evaluate
     from retwin.evaluation.experiments.propose import next_experiments
-    from retwin.evaluation.fidelity import measure_fidelity
+    from retwin.evaluation.fidelity.measure import measure_fidelity
     from retwin.nets.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, StateSpace
     from retwin.nets.training import Training
     from retwin.report import write_report

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import retwin as rt
 from retwin.errors import InputError
-from retwin.evaluation.fidelity import Overlay
+from retwin.evaluation.fidelity.overlay import Overlay
 from retwin.report.sections.explorer import packed
 from retwin.report.study import read_study
 from retwin.study.files import Roles

@@ -25,16 +25,15 @@ COLUMNS = {name: metric.head for name, metric in catalog.METRICS.items() if metr
 """Scores that are shown, and the heads of their columns."""
 DEMO = ("dt", "ibg_rg_command", "inversion")
 """What the demo compares: the original twin, and what is best here."""
-DEMO_PER_CLASS = 100
-"""Generated trajectories per class in the demo, a quarter of a study's, which keeps it short."""
-DEMO_HEALTHY = 125
-"""Emulated healthy trajectories in the demo: a promise at 5 % false alarms can then be decided."""
-DEMO_CALIBRATED = 20
-"""Healthy trajectories that calibrate each fold of the demo: of real machines there are few."""
-DEMO_SIMULATED = 10
-"""Healthy trajectories of each fold that the demo simulates."""
-DEMO_OVERLAID = 1
-"""Faulty trajectories of each class and fold that the page of the demo shows in full."""
+DEMO_SETTINGS: Any = {
+    "folds": 2,
+    "per_class": 100,  # generated trajectories, a quarter of a study's, which keeps it short
+    "emulated_healthy": 125,  # a promise at 5 % false alarms can then be decided
+    "calibrated": 20,  # healthy trajectories of each fold: of real machines there are few
+    "simulated": 10,  # healthy trajectories of each fold
+    "overlaid": 1,  # faulty trajectories of each class and fold, which the page shows in full
+}
+"""Settings of the plan of the demo."""
 DEMO_EPOCHS = 6
 """Epochs of the demo's surrogate, whose error is then a tenth of the discrepancy."""
 DEMO_MINUTES = 3
@@ -151,8 +150,7 @@ def demo(
     from retwin.study import StudyData, StudyPlan
     from retwin.update.surrogate import surrogate_training
 
-    data, folds = StudyData(), 2
-    folder = os.environ.get("RETWIN_DATA")
+    data, folder = StudyData(), os.environ.get("RETWIN_DATA")
     if folder:
         sets = Path(folder) / "armpi"
         names = [sets / name for name in ("real_a.mat", "my_dataset_test.mat")]
@@ -163,18 +161,7 @@ def demo(
         recorded = sets / "sim.mat"
         data = StudyData(twin=recorded if recorded.exists() else None, real=real)
     target = out or Path("demo", "real" if folder else "emulated")
-    plan = StudyPlan(
-        DEMO,
-        runs=runs,
-        seed=seed,
-        folds=folds,
-        per_class=DEMO_PER_CLASS,
-        emulated_healthy=DEMO_HEALTHY,
-        calibrated=DEMO_CALIBRATED,
-        simulated=DEMO_SIMULATED,
-        overlaid=DEMO_OVERLAID,
-        ablations=False,
-    )
+    plan = StudyPlan(DEMO, runs=runs, seed=seed, ablations=False, **DEMO_SETTINGS)
     titles = ", ".join(catalog.SOURCES[name].title for name in DEMO)
     kind = "real" if folder else "emulated"
     minutes = DEMO_MINUTES * plan.number_of_runs

@@ -14,9 +14,12 @@ _HOME = homes(
         "predict_records score_model stand_in",
         "diagnosers": "evaluate",
         "experiments.propose": "Proposal next_experiments",
-        "fidelity": "Fidelity Figure Overlay Simulation measure_fidelity measure_widening "
-        "predictive_overlay record_means simulate_records simulation_scores",
-        "identification": "Identification hold_out validate_identification",
+        "fidelity.figures": "Fidelity Figure",
+        "fidelity.measure": "measure_fidelity measure_widening",
+        "fidelity.overlay": "Overlay predictive_overlay",
+        "fidelity.simulation": "Simulation record_means simulate_records simulation_scores",
+        "identification.hold_out": "hold_out",
+        "identification.validation": "Identification validate_identification",
     }
 )
 

@@ -14,7 +14,7 @@ from retwin.data.quality.finding import Finding
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.labels import find_wrong_labels
 from retwin.diagnosis.pooled import pool_probabilities
-from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
+from retwin.evaluation.fidelity.simulation import Simulation, record_means, simulation_scores
 from retwin.scores.bootstrap import Draws, Resampling, bootstrap_means
 from retwin.scores.classification import METRICS, confusion, score
 from retwin.study.estimates import read_estimates

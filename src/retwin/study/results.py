@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from retwin.catalog import METRICS, SOURCES
 from retwin.data.quality.check import Checked
 from retwin.data.trajectories import HEALTHY, PER_SAMPLE, Trajectories
-from retwin.evaluation.fidelity import Fidelity, Overlay
+from retwin.evaluation.fidelity.figures import Fidelity
+from retwin.evaluation.fidelity.overlay import Overlay
 from retwin.results import SCHEMA, Results
 from retwin.scores.bootstrap import Draws
 from retwin.scores.comparison import MIN_RUNS, compare_runs, holm, no_verdict

@@ -25,12 +25,9 @@ from retwin.diagnosis import FittedDiagnoser
 from retwin.evaluation.choice import Choice, fit
 from retwin.evaluation.choice.surrogates import SurrogateSettings, stand_in
 from retwin.evaluation.diagnosers import finite_probabilities
-from retwin.evaluation.fidelity import (
-    measure_fidelity,
-    measure_widening,
-    predictive_overlay,
-    simulate_records,
-)
+from retwin.evaluation.fidelity.measure import measure_fidelity, measure_widening
+from retwin.evaluation.fidelity.overlay import predictive_overlay
+from retwin.evaluation.fidelity.simulation import simulate_records
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import save_model
@@ -169,22 +166,14 @@ class Work:
         """Labels of all real trajectories."""
         return self.files.real_data().labels
 
-    # The work of each job.
+    # The work of each job, by a method for each kind of job.
 
     def do(self, job: Job, progress: Progress | None = None) -> None:
         """Make the result of a job, unless it exists; record its costs, its warnings among them."""
         path = self.files.path(job)
         if path.exists():
             return
-        make = {
-            "surrogate": self._surrogate,
-            "residual": self._residual,
-            "update": self._update,
-            "diagnosis": self._diagnosis,
-            "simulation": self._simulation,
-            "fidelity": self._fidelity,
-            "portrait": self._overlay,
-        }[job.kind]
+        make = getattr(self, f"_{job.kind}")
         started = time.perf_counter()
         with warnings.catch_warnings(record=True) as given:
             warnings.simplefilter("always", UserWarning)
@@ -333,7 +322,7 @@ class Work:
         found.save(path)
         return {}
 
-    def _overlay(self, trial: Trial, path: Path) -> Costs:
+    def _portrait(self, trial: Trial, path: Path) -> Costs:
         """The predictive overlay of the fold's test trajectories, for display and no score."""
         labels = np.unique(self._labels[list(trial.fold[1])])
         shown = {i for label in labels for i in self._simulated(trial, label)}

@@ -25,17 +25,6 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-__all__ = [
-    "Fact",
-    "Proposal",
-    "channel_mapping",
-    "cut_at_pauses",
-    "facts_of",
-    "propose_mapping",
-    "proposed",
-    "shortest_pause",
-]
-
 COMMAND = re.compile(
     r"(^|[^a-z])(cmd|command(s|ed)?|set_?point(s)?|target(s)?|ref(erence)?|desired|demand|goal|"
     r"input(s)?|control|u|soll(wert)?|sp)([^a-z]|\d|$)"

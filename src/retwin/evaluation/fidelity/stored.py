@@ -70,13 +70,8 @@ class StoredArrays:
 def _concatenate(arrays: Sequence[NDArray]) -> NDArray:
     """Arrays along their first axis, filled with NaN up to the largest of the others."""
     shape = np.max([each.shape[1:] for each in arrays], axis=0).astype(int)
-    return np.concatenate(
-        [
-            np.pad(
-                each, ((0, 0), *((0, n) for n in shape - each.shape[1:])), constant_values=np.nan
-            )
-            if np.any(shape > each.shape[1:])
-            else each
-            for each in arrays
-        ]
-    )
+    padded = []
+    for each in arrays:
+        missing = [(0, 0), *((0, n) for n in shape - each.shape[1:])]
+        padded.append(np.pad(each, missing, constant_values=np.nan) if np.any(missing) else each)
+    return np.concatenate(padded)

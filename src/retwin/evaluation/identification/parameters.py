@@ -191,15 +191,14 @@ def _of_posterior(
     directions = _directions(before.names, vectors.T, along, open_from * UNIFORM)
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.atleast_2d(np.corrcoef(scaled.T))
-    made = estimates(
-        before,
+    intervals = np.quantile(found.samples, [0.025, 0.975], axis=0).T
+    about = (
         found.samples.mean(axis=0),
         deviation * width,
-        np.quantile(found.samples, [0.025, 0.975], axis=0).T,
+        intervals,
         deviation < open_from * UNIFORM,
-        sides,
-        bounded=True,
     )
+    made = estimates(before, *about, sides, bounded=True)
     return Uncertainty(made, correlation, directions, "posterior")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.evaluation.identification import Identification
+from retwin.evaluation.identification.validation import Identification
 from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row, record_panel
 from retwin.report.labels import behind
 from retwin.report.residual_panels import ChannelRecords, Errors, residual_figures
