@@ -68,17 +68,7 @@ def verify(
     values = {name: about.get(name) for name in properties}
     provenance = about.get("provenance")
     notes = provenance if isinstance(provenance, dict) else {}
-    answer(
-        {
-            "folder": str(folder),
-            "kind": about["kind"],
-            "bytes": size,
-            **values,
-            "provenance": notes,
-        },
-        f"{about['kind']}, {size / 1e6:.2f} MB",
-        table(("property", "value"), [*values.items(), *notes.items()]),
-        "",
-        f"{folder} is whole",
-        as_json=as_json,
-    )
+    kind, shown = about["kind"], table(("property", "value"), [*values.items(), *notes.items()])
+    facts = {"folder": str(folder), "kind": kind, "bytes": size, **values, "provenance": notes}
+    whole = f"{folder} is whole"
+    answer(facts, f"{kind}, {size / 1e6:.2f} MB", shown, "", whole, as_json=as_json)

@@ -116,12 +116,9 @@ def map_log(
         rate = sample_rate("--rate", rate)
     system = _channels_of(case, inputs, outputs)
     with bar("map") as show:
+        settings, report = TimeSettings(column=time, rate=rate), partial(show, log.name)
         made = propose_mapping(
-            log,
-            case=system,
-            time=TimeSettings(column=time, rate=rate),
-            progress=lambda share: show(log.name, share),
-            max_bytes=max_bytes,
+            log, case=system, time=settings, progress=report, max_bytes=max_bytes
         )
         parts = try_mapping(made.log, made.mapping, case=system)
         drawn = log_picture(made.log, parts)

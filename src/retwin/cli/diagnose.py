@@ -103,13 +103,10 @@ def _train(
     import retwin as rt
 
     with bar("train") as show:
+        classes = None if system is None else system.classes
+        report = partial(show, "classifier")
         diagnoser = rt.fit_diagnoser(
-            training,
-            classifier,
-            seed=seed,
-            classes=None if system is None else system.classes,
-            rate=rate,
-            progress=lambda share: show("classifier", share),
+            training, classifier, seed=seed, classes=classes, rate=rate, progress=report
         )
     assert diagnoser.fitted is not None
     accuracy = diagnoser.fitted.figures["accuracy"]
@@ -236,12 +233,8 @@ def _by_diagnoser(diagnoser: Diagnoser, trajectories: Trajectories, max_faults: 
     from retwin.evaluation.diagnosers import check_probabilities, scored
 
     with bar("diagnose") as show:
-        concluded = conclude(
-            diagnoser,
-            trajectories,
-            max_faults=max_faults,
-            progress=lambda share: show("faults", share),
-        )
+        report = partial(show, "faults")
+        concluded = conclude(diagnoser, trajectories, max_faults=max_faults, progress=report)
     probabilities, severities = concluded.probabilities, _severities(concluded)
     check_probabilities(trajectories, probabilities)
     labels = trajectories.labels.tolist()

@@ -153,15 +153,9 @@ def actuator(
     commands = _sampled(twin, model, case, seed)
     with bar("export") as show:
         show("compile", 0.0)
-        made = export_actuator(
-            twin,
-            out,
-            commands=commands,
-            seed=seed,
-            period=period,
-            draws=16384 if draws is None else draws,
-            onnx=not torchscript_only,
-        )
+        settings: Any = {"period": period, "onnx": not torchscript_only}
+        settings |= {} if draws is None else {"draws": draws}
+        made = export_actuator(twin, out, commands=commands, seed=seed, **settings)
     _print_actuator(made, out, as_json=as_json)
 
 

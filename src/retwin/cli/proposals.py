@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -37,16 +38,9 @@ def propose(
     twin = updated_twin(model)
     calibration = read(real, system, part="calibration", mapping=mapping)
     with bar("next") as show:
-        made = rt.next_experiments(
-            twin,
-            calibration,
-            system.sampler,
-            seed=seed,
-            count=count,
-            candidates=candidates,
-            tolerance=tolerance,
-            progress=lambda share: show("", share),
-        )
+        wanted: Any = {"count": count, "candidates": candidates, "tolerance": tolerance}
+        drawn, report = system.sampler, partial(show, "")
+        made = rt.next_experiments(twin, calibration, drawn, seed=seed, progress=report, **wanted)
     if isinstance(twin, rt.CorrectedTwin):
         nominal = twin.surrogate.predict(made.commands)
     else:

@@ -310,16 +310,9 @@ class Work:
         corrected = any(kind == "residual" for kind, _ in SOURCES[trial.job.name].needs)
         if self.plan.ablations and corrected and isinstance(twin, CorrectedTwin) and twin.random:
             rivals, widening = self._rivals(trial, twin), self._widening(trial)
-        found = measure_fidelity(
-            twin,
-            healthy,
-            seed=trial.seed("fidelity"),
-            rate=self.case.sensor_rate,
-            against=rivals,
-            widening=widening,
-            progress=trial.progress,
-        )
-        found.save(path)
+        seed, rate = trial.seed("fidelity"), self.case.sensor_rate
+        compared: Any = {"against": rivals, "widening": widening, "progress": trial.progress}
+        measure_fidelity(twin, healthy, seed=seed, rate=rate, **compared).save(path)
         return {}
 
     def _portrait(self, trial: Trial, path: Path) -> Costs:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -85,14 +85,8 @@ def mapped(
         Channels(tuple(each.name for each in some), tuple(each.unit for each in some))
         for some in (found.commands, found.measured)
     )
-    made = assemble(
-        raws,
-        source=Provenance(log.name, log.sha256),
-        case=None,
-        rate=found.rate,
-        budget=budget,
-        inputs=inputs if len(inputs) else None,
-    )
+    source, given = Provenance(log.name, log.sha256), inputs if len(inputs) else None
+    made = assemble(raws, source=source, case=None, rate=found.rate, budget=budget, inputs=given)
     notes = found.notes(log)
     twin = getattr(case, "twin", None)
     nominal = made.nominal
@@ -107,7 +101,7 @@ def mapped(
         each.sampling(found.rate, missing)
         for each, missing in zip(found.every, found.missing(), strict=True)
     )
-    source = Provenance(log.name, log.sha256, sampling, tuple(notes))
+    source = replace(source, sampling=sampling, notes=tuple(notes))
     return made.replace(nominal=nominal, outputs=outputs, provenance=(source,))
 
 

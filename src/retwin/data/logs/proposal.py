@@ -182,16 +182,9 @@ def _fact(signal: Signal) -> Fact:
     steps = np.diff(at)
     typical = float(np.median(steps)) if len(steps) else 0.0
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
-    return Fact(
-        signal.name,
-        signal.unit or unit_in_name(signal.name),
-        len(values),
-        1 / typical if typical > 0 else 0.0,
-        float(steps.max(initial=0.0)),
-        low,
-        high,
-        not low < high,
-    )
+    unit, rate = signal.unit or unit_in_name(signal.name), 1 / typical if typical > 0 else 0.0
+    longest = float(steps.max(initial=0.0))
+    return Fact(signal.name, unit, len(values), rate, longest, low, high, not low < high)
 
 
 def proposed(

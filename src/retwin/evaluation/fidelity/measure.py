@@ -272,15 +272,10 @@ def _features(residual: NDArray) -> NDArray:
     edges = np.arange(WINDOWS + 1) * residual.shape[1] // WINDOWS
     # Every window has a sample, however short a trajectory is.
     windows = [slice(a, max(a + 1, b)) for a, b in pairwise(edges)]
-    values = [
-        value
-        for window in windows
-        for value in (
-            residual[:, window].mean(axis=1),
-            residual[:, window].std(axis=1),
-            steps[:, window].mean(axis=1),
-        )
-    ]
+    values = []
+    for window in windows:
+        part = residual[:, window]
+        values += [part.mean(axis=1), part.std(axis=1), steps[:, window].mean(axis=1)]
     return np.concatenate(values, axis=1).astype(np.float32)
 
 
