@@ -14,10 +14,8 @@ _HOME = homes(
         "predict_records score_model stand_in",
         "diagnosers": "evaluate",
         "experiments.propose": "Proposal next_experiments",
-        "fidelity.figures": "Fidelity Figure",
-        "fidelity.measure": "measure_fidelity measure_widening",
-        "fidelity.overlay": "Overlay predictive_overlay",
-        "fidelity.simulation": "Simulation record_means simulate_records simulation_scores",
+        "fidelity": "Fidelity Figure Overlay Simulation measure_fidelity measure_widening "
+        "predictive_overlay record_means simulate_records simulation_scores",
         "identification.hold_out": "hold_out",
         "identification.validation": "Identification validate_identification",
     }

@@ -106,13 +106,10 @@ def _panel(latent: Component, colour: str) -> Panel:
         Line(*outline(values.edges, values.generated), "generated", colour, width=2.2),
     ]
     limits = f"{number(low, 1)} to {number(high, 1)}"
-    return Panel(
-        Axis(label, latent.unit, (low, high), count=7),
-        [Row(Axis("share per bin", kind="percent", from_zero=True), marks)],
-        with_unit(f"{title}, observed and generated, {limits}", latent.unit),
-        title,
-        height=300,
-    )
+    x = Axis(label, latent.unit, (low, high), count=7)
+    y = Axis("share per bin", kind="percent", from_zero=True)
+    alt = with_unit(f"{title}, observed and generated, {limits}", latent.unit)
+    return Panel(x, [Row(y, marks)], alt, title, height=300)
 
 
 def _agreement(study: Study, source: str) -> Table | None:

@@ -45,13 +45,9 @@ def _panel(study: Study, metric: str, curves: Curves) -> Panel:
     else:
         y = Axis(title, limits=(-0.02, 1.02), kind="share", step=0.2)
     marks = [_points(metric, name, points, factor) for name, points in curves.items()]
-    return Panel(
-        Axis("healthy trajectories", kind="log", ticks={count: str(count) for count in counts}),
-        [Row(y, marks)],
-        f"{title} against calibration trajectories",
-        title,
-        height=320,
-    )
+    x = Axis("healthy trajectories", kind="log", ticks={count: str(count) for count in counts})
+    alt = f"{title} against calibration trajectories"
+    return Panel(x, [Row(y, marks)], alt, title, height=320)
 
 
 def _points(metric: str, source: str, points: list[CurvePoint], factor: float) -> Points:
