@@ -182,13 +182,8 @@ def convert(
         check_target(each)
     if public is not None:
         with bar("fetch") as show:
-            sources.append(
-                download.fetch(
-                    public,
-                    progress=lambda share: show(public, share),
-                    max_bytes=max_bytes or download.MAX_BYTES,
-                )
-            )
+            limit, report = max_bytes or download.MAX_BYTES, partial(show, public)
+            sources.append(download.fetch(public, progress=report, max_bytes=limit))
     at_least("IN", sources, 1, "file", remedy="name it before OUT, or give --public NAME")
     found = read(sources, case or public, rate, max_bytes=max_bytes, mapping=mapping)
     parts = [found] if split is None else found.split(split, seed=seed)

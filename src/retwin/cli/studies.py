@@ -227,14 +227,12 @@ def _table(results: Results) -> Table:
 
     sources, shown = results.sources, _metrics(results)
     titles = [COLUMNS[metric] for metric in shown]
-    made = table(
-        ("training data" if results.classes else "source", *titles),
-        [
-            (source_name(name), *(_over_runs(source.runs(metric)) for metric in shown))
-            for name, source in sources.items()
-        ],
-        numbers=titles,
-    )
+    rows = [
+        (source_name(name), *(_over_runs(source.runs(metric)) for metric in shown))
+        for name, source in sources.items()
+    ]
+    heads = ("training data" if results.classes else "source", *titles)
+    made = table(heads, rows, numbers=titles)
     for name, figures in results.published.items():
         cells = (f"  paper: {source_name(name)}", *(figures.get(metric, "") for metric in shown))
         made.add_row(*map(plain, cells), style="dim")

@@ -233,19 +233,10 @@ def _comparisons(
                 difference = np.subtract(ours, theirs).tolist()
                 each = each.with_runs(difference, seed=seed, largest=largest)
             if each.interval is not None:
-                rows.append(
-                    {
-                        "a": a,
-                        "b": b,
-                        "metric": metric,
-                        **compare_runs(ours, theirs),
-                        "p_holm": None,
-                        "bootstrap_ci95": each.interval,
-                        "p_bootstrap": each.p,
-                        "p_verdict": None,
-                        "no_verdict": reason,
-                    }
-                )
+                row: dict[str, Any] = {"a": a, "b": b, "metric": metric}
+                row |= compare_runs(ours, theirs)
+                row |= {"bootstrap_ci95": each.interval, "p_bootstrap": each.p}
+                rows.append({**row, "p_holm": None, "p_verdict": None, "no_verdict": reason})
         _adjust([row for row in rows if row["metric"] in found.family], "p", "p_holm")
         out += rows
     for metric in found.compared:

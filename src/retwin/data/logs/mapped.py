@@ -123,12 +123,8 @@ def parts_of(
     commands = channels_of(log, taken, "hold", period)
     taken = table_of(mapping.outputs, outputs, "outputs", stated=stated)
     measured = channels_of(log, taken, "linear", period)
-    ideal = channels_of(
-        log,
-        table_of(mapping.nominal, outputs, "nominal") if mapping.nominal else [],
-        "linear",
-        period,
-    )
+    taken = table_of(mapping.nominal, outputs, "nominal") if mapping.nominal else []
+    ideal = channels_of(log, taken, "linear", period)
     found = Parts(log.end, rate, commands, measured, ideal)
     trigger = None
     if mapping.cut.by == "trigger" and mapping.cut.signal:

@@ -159,15 +159,12 @@ def _read_stamped(
         return None
     begin = (proposal.log.begin - other.begin) * NANOSECOND
     unstamped = [topic for topic, why in other.skipped.items() if why == NO_STAMP]
-    delays = np.concatenate(
-        [
-            one.times - two.times + begin
-            for one, two in pairs
-            if not any(one.name.startswith(topic) for topic in unstamped)
-        ]
-        or [np.array([-1.0])]
-    )
-    found = float(np.median(delays))
+    delays = [
+        one.times - two.times + begin
+        for one, two in pairs
+        if not any(one.name.startswith(topic) for topic in unstamped)
+    ]
+    found = float(np.median(np.concatenate(delays))) if delays else -1.0
     return (other, found) if 0 <= found < max_stamp_age else None
 
 
