@@ -22,7 +22,8 @@ import torch
 from record import record
 
 import retwin as rt
-from retwin.evaluation.fidelity import Fidelity, measure_fidelity
+from retwin.evaluation.fidelity.figures import Fidelity
+from retwin.evaluation.fidelity.measure import measure_fidelity
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.residual import Flow, Mixture, Refinement, fit_residual
 

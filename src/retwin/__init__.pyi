@@ -35,7 +35,7 @@ from retwin.evaluation import fit as fit
 from retwin.evaluation import score_model as score_model
 from retwin.evaluation.diagnosers import evaluate as evaluate
 from retwin.evaluation.experiments.propose import next_experiments as next_experiments
-from retwin.evaluation.fidelity import measure_fidelity as measure_fidelity
+from retwin.evaluation.fidelity.measure import measure_fidelity as measure_fidelity
 from retwin.nets.networks import CNN as CNN
 from retwin.nets.networks import LSTM as LSTM
 from retwin.nets.networks import MLP as MLP

@@ -14,7 +14,8 @@ import scoringrules
 from scipy.stats import ks_2samp, norm
 
 import retwin as rt
-from retwin.evaluation.fidelity import Fidelity, measure_fidelity, measure_widening
+from retwin.evaluation.fidelity.figures import Fidelity
+from retwin.evaluation.fidelity.measure import measure_fidelity, measure_widening
 from retwin.twins.twin import simulate_in_chunks
 
 STEPS, DRAWS = 60, 100

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 import retwin as rt
 from retwin.errors import InputError
-from retwin.evaluation.fidelity import Overlay
+from retwin.evaluation.fidelity.overlay import Overlay
 from retwin.report.sections.explorer import packed
 from retwin.report.study import read_study
 from retwin.study.files import Roles
-from retwin.study.results import _poses
+from retwin.study.results import _overlay_arrays
 from retwin.study.work import Work
 
 Study = tuple[dict[str, Any], dict[str, NDArray]]
@@ -128,7 +128,7 @@ def test_what_a_study_keeps_of_poses(
     overlay = Overlay(
         rt.Channels((), ()), some.ids[backwards], bands[backwards], unknown, unknown, unknown
     )
-    kept = _poses(work, some, overlay)
+    kept = _overlay_arrays(work, some, overlay)
     for name, path in (
         ("pose/nominal", some.nominal),
         ("pose/observed", some.observed),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.evaluation.fidelity import predictive_overlay
+from retwin.evaluation.fidelity.overlay import predictive_overlay
 from retwin.nets.training import Training
 from retwin.twins import NoisyTwin, RampSampler
 from retwin.update import OutsideTrainingWarning

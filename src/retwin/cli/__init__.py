@@ -74,23 +74,18 @@ app = Commands(
     cls=FirstScreen,
     pretty_exceptions_enable=False,
 )
-app.command(epilog=example("retwin demo"))(studies.demo)
-app.command(epilog=example("retwin doctor"))(doctor.doctor)
-app.command(
-    epilog=example("retwin identify plant.fmu log.csv --free gain=0.1:10 --out identified")
-)(identify.identify)
-app.command(epilog=example("retwin fit armpi --twin-data sim.mat --real real.mat --out model"))(
-    fit.fit
-)
-app.command(epilog=example("retwin evaluate model --real other.csv"))(models.evaluate)
-app.command(epilog=example("retwin generate model --per-class 400 --out made.npz"))(models.generate)
-app.command("next", epilog=example("retwin next armpi model --real real.mat --out next.npz"))(
-    proposals.propose
-)
-app.command(epilog=example("retwin study armpi --twin-data sim.mat --real real.mat --out study"))(
-    studies.study
-)
-app.command(epilog=example("retwin report study"))(studies.report)
+for function, shown in (
+    (studies.demo, "demo"),
+    (doctor.doctor, "doctor"),
+    (identify.identify, "identify plant.fmu log.csv --free gain=0.1:10 --out identified"),
+    (fit.fit, "fit armpi --twin-data sim.mat --real real.mat --out model"),
+    (models.evaluate, "evaluate model --real other.csv"),
+    (models.generate, "generate model --per-class 400 --out made.npz"),
+    (proposals.propose, "next armpi model --real real.mat --out next.npz"),
+    (studies.study, "study armpi --twin-data sim.mat --real real.mat --out study"),
+    (studies.report, "report study"),
+):
+    app.command(shown.split()[0], epilog=example(f"retwin {shown}"))(function)
 app.add_typer(data.app, name="data")
 app.add_typer(twins.app, name="twin")
 app.add_typer(diagnose.app, name="diagnose")

@@ -7,17 +7,7 @@ from typing import Annotated
 
 from retwin.checks import require
 from retwin.cli.commands import Commands
-from retwin.cli.options import (
-    Json,
-    LogMapping,
-    MaxBytes,
-    Model,
-    OtherCase,
-    Real,
-    Seed,
-    argument,
-    option,
-)
+from retwin.cli.options import Json, LogMapping, MaxBytes, Model, OtherCase, Seed, argument, option
 from retwin.cli.reading import read, saved, updated_twin
 from retwin.cli.terminal import answer, bar, command_given, example, note, table
 from retwin.serialisation.places import check_place
@@ -31,7 +21,7 @@ app = Commands(
 @app.command(epilog=example("retwin bundle save model real.mat --diagnoser cnn --out bundle"))
 def save(
     model: Model,
-    real: Real,
+    real: Annotated[Path, argument("REAL", "The trajectories it was calibrated on.")],
     out: Annotated[Path, option("FOLDER", "Where to save the bundle.")],
     diagnoser: Annotated[Path | None, option("FOLDER", "Folder of a diagnoser.")] = None,
     case: OtherCase = None,
@@ -78,17 +68,7 @@ def verify(
     values = {name: about.get(name) for name in properties}
     provenance = about.get("provenance")
     notes = provenance if isinstance(provenance, dict) else {}
-    answer(
-        {
-            "folder": str(folder),
-            "kind": about["kind"],
-            "bytes": size,
-            **values,
-            "provenance": notes,
-        },
-        f"{about['kind']}, {size / 1e6:.2f} MB",
-        table(("property", "value"), [*values.items(), *notes.items()]),
-        "",
-        f"{folder} is whole",
-        as_json=as_json,
-    )
+    kind, shown = about["kind"], table(("property", "value"), [*values.items(), *notes.items()])
+    facts = {"folder": str(folder), "kind": kind, "bytes": size, **values, "provenance": notes}
+    whole = f"{folder} is whole"
+    answer(facts, f"{kind}, {size / 1e6:.2f} MB", shown, "", whole, as_json=as_json)

@@ -116,12 +116,9 @@ def map_log(
         rate = sample_rate("--rate", rate)
     system = _channels_of(case, inputs, outputs)
     with bar("map") as show:
+        settings, report = TimeSettings(column=time, rate=rate), partial(show, log.name)
         made = propose_mapping(
-            log,
-            case=system,
-            time=TimeSettings(column=time, rate=rate),
-            progress=lambda share: show(log.name, share),
-            max_bytes=max_bytes,
+            log, case=system, time=settings, progress=report, max_bytes=max_bytes
         )
         parts = try_mapping(made.log, made.mapping, case=system)
         drawn = log_picture(made.log, parts)
@@ -185,13 +182,8 @@ def convert(
         check_target(each)
     if public is not None:
         with bar("fetch") as show:
-            sources.append(
-                download.fetch(
-                    public,
-                    progress=lambda share: show(public, share),
-                    max_bytes=max_bytes or download.MAX_BYTES,
-                )
-            )
+            limit, report = max_bytes or download.MAX_BYTES, partial(show, public)
+            sources.append(download.fetch(public, progress=report, max_bytes=limit))
     at_least("IN", sources, 1, "file", remedy="name it before OUT, or give --public NAME")
     found = read(sources, case or public, rate, max_bytes=max_bytes, mapping=mapping)
     parts = [found] if split is None else found.split(split, seed=seed)
@@ -260,29 +252,28 @@ def _seen(made: Proposal) -> Table:
     return table(head, rows, numbers=head[2:5])
 
 
+SAMPLING = {
+    "channel": "{channel}",
+    "signal": "{signal}",
+    "Hz": "{rate:.4g}",
+    "resampled": "{method}",
+    "missing": "{missing:.2%}",
+    "bridged s": "{bridged:.3g}",
+    "longest s": "{longest:.3g}",
+    "note": "{note}",
+}
+"""Heads of the table of samplings, and what stands below them."""
+
+
 def _samplings(facts: dict[str, Any]) -> list[Table]:
     """For each log, how its channels came to their samples."""
-    head = ("channel", "signal", "Hz", "resampled", "missing", "bridged s", "longest s", "note")
+    sources = (source["sampling"] for source in facts["provenance"] if "sampling" in source)
+    rows = (
+        [[cell.format(**own) for cell in SAMPLING.values()] for own in each] for each in sources
+    )
     return [
-        table(
-            head,
-            [
-                (
-                    each["channel"],
-                    each["signal"],
-                    f"{each['rate']:.4g}",
-                    each["method"],
-                    f"{each['missing']:.2%}",
-                    f"{each['bridged']:.3g}",
-                    f"{each['longest']:.3g}",
-                    each["note"],
-                )
-                for each in source["sampling"]
-            ],
-            numbers=("Hz", "missing", "bridged s", "longest s"),
-        )
-        for source in facts["provenance"]
-        if "sampling" in source
+        table(tuple(SAMPLING), each, numbers=("Hz", "missing", "bridged s", "longest s"))
+        for each in rows
     ]
 
 

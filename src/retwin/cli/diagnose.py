@@ -20,8 +20,6 @@ from retwin.cli.options import (
     Json,
     LogMapping,
     MaxBytes,
-    Measured,
-    Probabilities,
     Seed,
     argument,
     leave_out,
@@ -48,7 +46,7 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.diagnosis import Conclusion, Diagnoser, FittedDiagnoser
     from retwin.scores.classification import Scores
 
-TEXTS = ("trajectory", "diagnosis", "label", "commands", "reason", "guard")
+TEXTS = ("diagnosis", "label", "commands", "reason", "guard")
 """Columns of diagnoses that hold no numbers."""
 EMULATED = "These trajectories are EMULATED: no real measurements."
 
@@ -105,13 +103,10 @@ def _train(
     import retwin as rt
 
     with bar("train") as show:
+        classes = None if system is None else system.classes
+        report = partial(show, "classifier")
         diagnoser = rt.fit_diagnoser(
-            training,
-            classifier,
-            seed=seed,
-            classes=None if system is None else system.classes,
-            rate=rate,
-            progress=lambda share: show("classifier", share),
+            training, classifier, seed=seed, classes=classes, rate=rate, progress=report
         )
     assert diagnoser.fitted is not None
     accuracy = diagnoser.fitted.figures["accuracy"]
@@ -143,9 +138,9 @@ def _invert(
 @app.command(epilog=example("retwin diagnose predict cnn real.mat --case armpi"))
 def predict(
     model: Annotated[Path, argument("MODEL", "A diagnoser, a bundle, or its ONNX export.")],
-    file: Measured,
+    file: Annotated[Path, argument("FILE", "Trajectories; labels are not needed.")],
     case: CaseOption = None,
-    out: Probabilities = None,
+    out: Annotated[Path | None, option("FILE", "CSV file for all probabilities.", "--out")] = None,
     max_faults: Annotated[
         int, option("N", "2 also tries pairs of stuck actuators.", "--max-faults")
     ] = 1,
@@ -180,9 +175,9 @@ def predict(
             "scores": made.scores,
         },
         table(
-            tuple(made.columns),
-            [[_shown(each[name]) for name in made.columns.values()] for each in made.rows],
-            numbers=[head for head in made.columns if head not in TEXTS],
+            ("trajectory", *made.shown),
+            [[each["id"], *(_shown(each[name]) for name in made.shown)] for each in made.rows],
+            numbers=[name for name in made.shown if name not in TEXTS],
         ),
         *([EMULATED] if trajectories.emulated else []),
         *([str(made.scores)] if made.scores is not None else []),
@@ -204,8 +199,8 @@ class Diagnosed:
         Of the probabilities.
     rows : list of dict
         The values of each trajectory, also as JSON.
-    columns : dict of str to str
-        Names of those that the table shows, by their heads.
+    shown : sequence of str
+        Names of those that the table shows beside the trajectory.
     written : sequence of str
         Names of those that the CSV file has beside the probabilities.
     scores : Scores or None
@@ -217,7 +212,7 @@ class Diagnosed:
 
     classes: Sequence[str]
     rows: list[dict[str, Any]]
-    columns: dict[str, str]
+    shown: Sequence[str]
     written: Sequence[str]
     scores: Scores | None = None
     remark: str = ""
@@ -226,13 +221,10 @@ class Diagnosed:
 def _by_bundle(bundle: Bundle | Portable, trajectories: Trajectories) -> Diagnosed:
     """Diagnoses of a bundle, with the verdicts of its guard."""
     found = bundle.predict(trajectories)
-    rows = _diagnoses(trajectories, found.classes, found.probabilities, found.diagnosis)
-    verdicts = zip(found.verdicts.verdict.tolist(), found.verdicts.reason.tolist(), strict=True)
-    for each, (verdict, reason) in zip(rows, verdicts, strict=True):
-        each |= {"guard": verdict, "reason": reason}
-    written = ("diagnosis", "guard", "reason")
-    columns = {"trajectory": "id", **{n: n for n in ("diagnosis", "probability", *written[1:])}}
-    return Diagnosed(found.classes, rows, columns, written)
+    verdicts = {"guard": found.verdicts.verdict.tolist(), "reason": found.verdicts.reason.tolist()}
+    rows = _diagnoses(trajectories, found.classes, found.probabilities, found.diagnosis, verdicts)
+    shown = ("diagnosis", "probability", *verdicts)
+    return Diagnosed(found.classes, rows, shown, ("diagnosis", *verdicts))
 
 
 def _by_diagnoser(diagnoser: Diagnoser, trajectories: Trajectories, max_faults: int) -> Diagnosed:
@@ -241,54 +233,46 @@ def _by_diagnoser(diagnoser: Diagnoser, trajectories: Trajectories, max_faults: 
     from retwin.evaluation.diagnosers import check_probabilities, scored
 
     with bar("diagnose") as show:
-        concluded = conclude(
-            diagnoser,
-            trajectories,
-            max_faults=max_faults,
-            progress=lambda share: show("faults", share),
-        )
+        report = partial(show, "faults")
+        concluded = conclude(diagnoser, trajectories, max_faults=max_faults, progress=report)
     probabilities, severities = concluded.probabilities, _severities(concluded)
     check_probabilities(trajectories, probabilities)
     labels = trajectories.labels.tolist()
     labelled = bool(trajectories.known_labels) and "" not in labels
-    classes = diagnoser.classes
-    rows = _diagnoses(trajectories, classes, probabilities, concluded.labels)
-    outside = _outside(diagnoser, trajectories).tolist()
-    rest = zip(labels, outside, severities, concluded.reason.tolist(), strict=True)
-    for each, (label, beyond, own, reason) in zip(rows, rest, strict=True):
-        each["reason"] = reason
-        each["label"] = label or None
-        each["commands"] = "outside" if beyond else "ok"
-        each |= own
-    more = ["commands"] * any(outside) + ["reason"] * any(each["reason"] for each in rows)
-    shown = ("diagnosis", "probability", *severities[0], "label", *more)
+    classes, outside = diagnoser.classes, _outside(diagnoser, trajectories).tolist()
+    columns: dict[str, list[Any]] = {
+        "reason": concluded.reason.tolist(),
+        "label": [label or None for label in labels],
+        "commands": ["outside" if beyond else "ok" for beyond in outside],
+        **severities,
+    }
+    more = ["commands"] * any(outside) + ["reason"] * any(columns["reason"])
     return Diagnosed(
         classes,
-        rows,
-        {"trajectory": "id", **{name: name for name in shown}},
+        _diagnoses(trajectories, classes, probabilities, concluded.labels, columns),
+        ("diagnosis", "probability", *severities, "label", *more),
         ["diagnosis", "reason", *["unknown"] * (concluded.found is not None)],
         scored(trajectories, probabilities, classes) if labelled else None,
         concluded.remark,
     )
 
 
-def _severities(concluded: Conclusion) -> list[dict[str, float | None]]:
-    """What an inversion gives besides for the most probable class of each trajectory."""
+def _severities(concluded: Conclusion) -> dict[str, list[float | None]]:
+    """What an inversion gives besides for the most probable class of each trajectory, by name."""
     from retwin.diagnosis import Diagnosis, StateDiagnosis
 
-    found, count = concluded.found, len(concluded.labels)
+    found = concluded.found
     if found is None:
-        return [{} for _ in range(count)]
+        return {}
     columns = {"unknown": found.unknown}
     if isinstance(found, Diagnosis) and found.several.any():
         columns["several"] = found.several
     if isinstance(found, StateDiagnosis):
-        own = (np.arange(count), found.probabilities.argmax(axis=1))
+        own = (np.arange(len(concluded.labels)), found.probabilities.argmax(axis=1))
         columns |= {"size": found.size.value[own], "onset in s": found.onset.value[own]}
-    return [
-        {name: None if np.isnan(each[i]) else float(each[i]) for name, each in columns.items()}
-        for i in range(count)
-    ]
+    return {
+        name: [None if np.isnan(x) else float(x) for x in each] for name, each in columns.items()
+    }
 
 
 def _outside(diagnoser: Diagnoser, trajectories: Trajectories) -> NDArray:
@@ -309,26 +293,26 @@ def _shown(value: object) -> str:
 
 
 def _diagnoses(
-    trajectories: Trajectories, classes: Sequence[str], probabilities: NDArray, labels: NDArray
+    trajectories: Trajectories,
+    classes: Sequence[str],
+    probabilities: NDArray,
+    labels: NDArray,
+    others: dict[str, list[Any]],
 ) -> list[dict[str, Any]]:
-    """The diagnosis of each trajectory, and the probability of every class.
+    """The diagnosis of each trajectory, the probability of every class, and other columns.
 
     A trajectory with a probability that is not finite has None for each probability.
     """
-    made = []
-    rows = zip(trajectories.ids.tolist(), labels.tolist(), probabilities, strict=True)
-    for name, label, row in rows:
-        finite = bool(np.isfinite(row).all())
-        values = row.tolist() if finite else [None] * len(classes)
-        made.append(
-            {
-                "id": name,
-                "diagnosis": label,
-                "probability": float(row.max()) if finite else None,
-                "probabilities": dict(zip(classes, values, strict=True)),
-            }
-        )
-    return made
+    unknown = [None] * len(classes)
+    known = [row.tolist() if np.isfinite(row).all() else unknown for row in probabilities]
+    columns = {
+        "id": trajectories.ids.tolist(),
+        "diagnosis": labels.tolist(),
+        "probability": [None if row is unknown else max(row) for row in known],
+        "probabilities": [dict(zip(classes, row, strict=True)) for row in known],
+        **others,
+    }
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _write_probabilities(out: Path, made: Diagnosed) -> None:

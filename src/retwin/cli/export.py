@@ -142,7 +142,9 @@ def actuator(
     check_place(out, folder=not torque)
     twin = updated_twin(model)
     if torque:
-        _write_torque(twin, out, joints, steps, _sampled(twin, model, case, seed), seed, as_json)
+        commands = _sampled(twin, model, case, seed)
+        asked = {"joints": joints, "commands": commands, "seed": seed, "history": steps}
+        _write_torque(twin, out, asked, as_json=as_json)
         return
     from retwin.deploy.actuator.draws import causal_part
     from retwin.deploy.actuator.export import export_actuator
@@ -151,50 +153,23 @@ def actuator(
     commands = _sampled(twin, model, case, seed)
     with bar("export") as show:
         show("compile", 0.0)
-        made = export_actuator(
-            twin,
-            out,
-            commands=commands,
-            seed=seed,
-            period=period,
-            draws=16384 if draws is None else draws,
-            onnx=not torchscript_only,
-        )
+        settings: Any = {"period": period, "onnx": not torchscript_only}
+        settings |= {} if draws is None else {"draws": draws}
+        made = export_actuator(twin, out, commands=commands, seed=seed, **settings)
     _print_actuator(made, out, as_json=as_json)
 
 
-def _write_torque(
-    twin: Any,
-    out: Path,
-    joints: list[Joint],
-    history: tuple[int, ...],
-    commands: NDArray,
-    seed: int,
-    as_json: bool,
-) -> None:
+def _write_torque(twin: Any, out: Path, asked: dict[str, Any], *, as_json: bool) -> None:
     """Write the network of torques, and print the settings with which simulators load it."""
     from retwin.deploy.actuator.torque_net import export_actuator_net
 
     with bar("export") as show:
-        made = export_actuator_net(
-            twin,
-            out,
-            joints=joints,
-            commands=commands,
-            seed=seed,
-            history=history,
-            progress=lambda share: show("train", share),
-        )
-    settings = {
-        "network_file": str(made.network_file),
-        "input_order": made.input_order,
-        "input_idx": list(made.input_idx),
-        "pos_scale": made.pos_scale,
-        "vel_scale": made.vel_scale,
-        "torque_scale": made.torque_scale,
-    }
+        made = export_actuator_net(twin, out, **asked, progress=lambda share: show("train", share))
+    names = ("network_file", "input_order", "input_idx", "pos_scale", "vel_scale", "torque_scale")
+    values = vars(made) | {"input_idx": list(made.input_idx)}
+    settings = {name: values[name] for name in names}
     answer(
-        {**settings, "period": made.period, "unit": made.unit, "error": made.error},
+        settings | values,
         table(("of ActuatorNetMLPCfg", "value"), list(settings.items())),
         f"The simulation must call it every {made.period:g} s. Torques are in {made.unit}; their "
         f"error on held-out simulations of the twin, noise included, is {made.error:.2g} of their "

@@ -1,25 +1,19 @@
-"""Films of a trajectory: the options of `retwin twin simulate --film`, and the drawing."""
+"""Films of a trajectory, of `retwin twin simulate --film`: their settings, and the drawing."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from retwin.checks import given
-from retwin.cli.options import leave_out, option, rare
+from retwin.cli.options import leave_out
 from retwin.cli.terminal import answer, bar
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.data.trajectories import Trajectories
     from retwin.twins.twin import Twin
-
-Film = Annotated[Path | None, option("FILE", "Film of --out, else of --commands: *.mp4 or *.gif.")]
-FilmedId = Annotated[str | None, rare("ID", "The filmed trajectory; else the first.", "--id")]
-FramesPerSecond = Annotated[float | None, rare("HZ", "Pictures of the film per second; else 25.")]
-FilmSize = Annotated[str | None, rare("WxH", "Of the film; else 640x480.")]
-Renderer = Annotated[Literal["mujoco", "stick"] | None, rare("", "What draws; else the best here.")]
 
 
 def film_settings(
@@ -43,7 +37,6 @@ def draw_film(
     twin: Twin,
     system: Case | None,
     settings: dict[str, Any],
-    seed: int,
 ) -> None:
     """Film a trajectory, with the bands of a corrected twin."""
     from retwin.cases.animation import animate
@@ -53,15 +46,8 @@ def draw_film(
     case = given("--case", system, expected, remedy=remedy)
     updated = twin if isinstance(twin, CorrectedTwin | DynamicsTwin) else None
     with bar("film") as show:
-        path = animate(
-            trajectories,
-            case,
-            film,
-            updated=updated,
-            seed=seed,
-            progress=lambda share: show("draw", share),
-            **settings,
-        )
+        settings = {"updated": updated, "progress": lambda share: show("draw", share), **settings}
+        path = animate(trajectories, case, film, **settings)
     answer(path, str(path))
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from retwin.cases.opened_twin import OpenedTwin
     from retwin.data.quality.check import Checked
     from retwin.data.trajectories import Trajectories
-    from retwin.evaluation.identification import Identification
+    from retwin.evaluation.identification.validation import Identification
 
 UNRATED = (".fmu", ".xml", ".urdf")
 """Suffixes of twins that take any sample rate."""
@@ -106,7 +106,7 @@ def identify(
     """
     from retwin.cases import Columns, LogReader
     from retwin.deploy.identified import HOLDS, save_identification
-    from retwin.evaluation import identification as room
+    from retwin.evaluation.identification import validation as room
     from retwin.twins import keep_workers
     from retwin.update.agreement import check_with_twin
     from retwin.update.identification import identify as run
@@ -159,8 +159,7 @@ def _separated(
     read: Logs, share: float | None, seed: int
 ) -> tuple[Trajectories, Trajectories | None]:
     """What is used and what is held out: the test of the case, unless a share is given."""
-    from retwin.evaluation.identification import hold_out
-    from retwin.evaluation.identification.hold_out import SHARE
+    from retwin.evaluation.identification.hold_out import SHARE, hold_out
 
     if read.test is not None and share is None:
         return read.trajectories, read.test

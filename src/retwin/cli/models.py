@@ -18,7 +18,6 @@ from retwin.cli.options import (
     MaxBytes,
     Model,
     OtherCase,
-    PerClass,
     Seed,
     argument,
     option,
@@ -46,7 +45,7 @@ def generate(
     bands: Annotated[
         bool, option("", "Write mean and 90 % band of --commands, also as *.png.", "--bands")
     ] = False,
-    per_class: PerClass = 400,
+    per_class: Annotated[int, option("N", "Trajectories per class.")] = 400,
     case: OtherCase = None,
     seed: Seed = 0,
     workers: Workers = None,

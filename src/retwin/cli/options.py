@@ -60,10 +60,6 @@ OtherCase = Annotated[
     str | None, case_option(help="If another than it was fitted for.", rich_help_panel=RARE)
 ]
 Model = Annotated[Path, argument("MODEL", "Folder of a corrected twin.")]
-Real = Annotated[Path, argument("REAL", "The trajectories it was calibrated on.")]
-Measured = Annotated[Path, argument("FILE", "Trajectories; labels are not needed.")]
-Probabilities = Annotated[Path | None, option("FILE", "CSV file for all probabilities.", "--out")]
-PerClass = Annotated[int, option("N", "Trajectories per class.")]
 Rate = Annotated[float | None, option("HZ", "Samples per second, if the file has none.", "--rate")]
 LogMapping = Annotated[Path | None, option("FILE", "What `retwin data map` wrote.", "--mapping")]
 Inputs = Annotated[str, option("NAMES", "Of a function's inputs, joined by commas.", "--inputs")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -37,27 +38,16 @@ def propose(
     twin = updated_twin(model)
     calibration = read(real, system, part="calibration", mapping=mapping)
     with bar("next") as show:
-        made = rt.next_experiments(
-            twin,
-            calibration,
-            system.sampler,
-            seed=seed,
-            count=count,
-            candidates=candidates,
-            tolerance=tolerance,
-            progress=lambda share: show("", share),
-        )
+        wanted: Any = {"count": count, "candidates": candidates, "tolerance": tolerance}
+        drawn, report = system.sampler, partial(show, "")
+        made = rt.next_experiments(twin, calibration, drawn, seed=seed, progress=report, **wanted)
     if isinstance(twin, rt.CorrectedTwin):
         nominal = twin.surrogate.predict(made.commands)
     else:
         nominal = twin.simulate(made.commands, seed=seed).nominal
+    nothing = np.full_like(nominal, np.nan)
     commands = rt.Trajectories(
-        made.commands,
-        nominal,
-        np.full_like(nominal, np.nan),
-        twin.rate,
-        inputs=twin.inputs,
-        outputs=twin.outputs,
+        made.commands, nominal, nothing, twin.rate, inputs=twin.inputs, outputs=twin.outputs
     )
     rt.save(commands, out)
     curve = [_curve(made)] if made.curve else []
@@ -112,9 +102,7 @@ def _values(made: Proposal, out: Path) -> dict[str, Any]:
     """The result as JSON."""
 
     def listed(points: Any) -> list[dict[str, Any]]:
-        return [
-            {"trajectories": p.trajectories, "excess": p.excess, "recall": p.recall} for p in points
-        ]
+        return [{**vars(point), "recall": point.recall} for point in points]
 
     return {
         "saved": str(out),
@@ -125,5 +113,5 @@ def _values(made: Proposal, out: Path) -> dict[str, Any]:
         "random_gain": made.random_gain,
         "chosen": listed(made.ahead),
         "random": listed(made.ahead_random),
-        "curve": [{"trajectories": p.trajectories, "error": p.error} for p in made.curve],
+        "curve": [vars(point) for point in made.curve],
     }

@@ -139,20 +139,11 @@ def read(
         See `rt.load`.
 
     """
-    if isinstance(files, Path):
-        return _read(files, case, rate, part, max_bytes, mapping)
-    sets = [_read(file, case, rate, part, max_bytes, mapping) for file in files]
-    return sets[0] if len(sets) == 1 else Trajectories.concatenate(sets)
-
-
-def _read(
-    file: Path,
-    case: DataCase | str | None,
-    rate: float | None,
-    part: Part,
-    max_bytes: int | None,
-    mapping: Path | None,
-) -> Trajectories:
+    if not isinstance(files, Path):
+        given = {"part": part, "max_bytes": max_bytes, "mapping": mapping}
+        sets = [read(file, case, rate, **given) for file in files]  # type: ignore[arg-type]
+        return sets[0] if len(sets) == 1 else Trajectories.concatenate(sets)
+    file = files
     log = mapping is None and file.exists() and (is_log(file) or file.is_dir())
     if isinstance(case, str):  # a built-in case without torch has no twin to read logs by
         case = case_named(case) if log and not file.is_dir() else data_case(case)
@@ -216,7 +207,7 @@ def read_signals(files: Sequence[Path], max_bytes: int | None = None) -> Traject
         zeros = partial(lambda row, u: np.tile(row, (*u.shape[:2], 1)), nothing)
         twin = FunctionTwin(zeros, rate=rate, inputs=Channels((), ()), outputs=channels)
         found = reader.trajectories(files, twin).trajectories
-        seen = np.where(found.mask, found.observed, np.nan)
+        seen = found.measured
         low, high = np.nanmin(seen, axis=(0, 1)), np.nanmax(seen, axis=(0, 1))
         fixed = [n for n, least, most in zip(names, low, high, strict=True) if least == most]
         if not fixed or len(fixed) == len(names):

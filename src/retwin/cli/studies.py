@@ -25,80 +25,73 @@ COLUMNS = {name: metric.head for name, metric in catalog.METRICS.items() if metr
 """Scores that are shown, and the heads of their columns."""
 DEMO = ("dt", "ibg_rg_command", "inversion")
 """What the demo compares: the original twin, and what is best here."""
-DEMO_PER_CLASS = 100
-"""Generated trajectories per class in the demo, a quarter of a study's, which keeps it short."""
-DEMO_HEALTHY = 125
-"""Emulated healthy trajectories in the demo: a promise at 5 % false alarms can then be decided."""
-DEMO_CALIBRATED = 20
-"""Healthy trajectories that calibrate each fold of the demo: of real machines there are few."""
-DEMO_SIMULATED = 10
-"""Healthy trajectories of each fold that the demo simulates."""
-DEMO_OVERLAID = 1
-"""Faulty trajectories of each class and fold that the page of the demo shows in full."""
+DEMO_SETTINGS: Any = {
+    "folds": 2,
+    "per_class": 100,  # generated trajectories, a quarter of a study's, which keeps it short
+    "emulated_healthy": 125,  # a promise at 5 % false alarms can then be decided
+    "calibrated": 20,  # healthy trajectories of each fold: of real machines there are few
+    "simulated": 10,  # healthy trajectories of each fold
+    "overlaid": 1,  # faulty trajectories of each class and fold, which the page shows in full
+}
+"""Settings of the plan of the demo."""
 DEMO_EPOCHS = 6
 """Epochs of the demo's surrogate, whose error is then a tenth of the discrepancy."""
 DEMO_MINUTES = 3
 """Minutes that a run of the demo takes at most on two cores, as measured."""
 COMPARED = {"a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict"}
 """What is printed of a comparison as JSON."""
-StudyFolder = Annotated[Path, option("FOLDER", "Called again, the study goes on there.")]
-RealSet = Annotated[Path | None, option("FILE", "One real set, split into --folds.")]
 Folds = Annotated[int, option("N", "Folds of --real.")]
-CalibrationSet = Annotated[Path | None, option("FILE", "Or one to calibrate on, and --test.")]
-TestSet = Annotated[Path | None, option("FILE", "One to test on.")]
-OneFile = Annotated[Path | None, option("FILE", "Or one file that the case splits.")]
-TwinSet = Annotated[Path | None, option("FILE", "Trajectories of the twin; else simulated.")]
-Sources = Annotated[
-    str | None,
-    option(
-        "NAMES",
-        "Joined by commas, or all; else dt (or twin), ibg, ibg_rg.",
-        autocompletion=complete_sources,
-    ),
-]
-Preset = Annotated[
-    str,
-    option("NAME", "quick or paper: classifier, training, runs.", names=catalog.PRESETS),
-]
-Classifier = Annotated[
-    str | None,
-    rare("NAME", "cnn, lstm or rocket; else the preset's.", names=catalog.CLASSIFIERS),
-]
 Runs = Annotated[int | None, option("N", "Runs; else the preset's.")]
 Rate = Annotated[float | None, rare("HZ", "Rate of the features; else the sensor's.")]
-PerClass = Annotated[int | None, option("N", "Generated trajectories; else the case's.")]
-CalibrateOn = Annotated[str, rare("NAME", "healthy or all.", names=catalog.CALIBRATE_ON)]
-RandomOnset = Annotated[bool, rare("", "Draw the onset of stuck motors.", "--random-onset")]
-EncoderNoise = Annotated[float, rare("X", "Noise on frozen joints, in command units.")]
-LearningCurve = Annotated[
-    bool, rare("", "Also calibrate on 1, 2, 4, 6 … healthy ones.", "--learning-curve")
-]
-Processes = Annotated[int | None, rare("N", "Jobs at a time; else one per core.")]
 
 
 def study(
     case: CaseArgument,
-    out: StudyFolder,
-    real: RealSet = None,
+    out: Annotated[Path, option("FOLDER", "Called again, the study goes on there.")],
+    real: Annotated[Path | None, option("FILE", "One real set, split into --folds.")] = None,
     folds: Folds = 3,
-    calibration: CalibrationSet = None,
-    test: TestSet = None,
-    data: OneFile = None,
-    twin_data: TwinSet = None,
+    calibration: Annotated[
+        Path | None, option("FILE", "Or one to calibrate on, and --test.")
+    ] = None,
+    test: Annotated[Path | None, option("FILE", "One to test on.")] = None,
+    data: Annotated[Path | None, option("FILE", "Or one file that the case splits.")] = None,
+    twin_data: Annotated[
+        Path | None, option("FILE", "Trajectories of the twin; else simulated.")
+    ] = None,
     mapping: LogMapping = None,
-    sources: Sources = None,
-    preset: Preset = "quick",
+    sources: Annotated[
+        str | None,
+        option(
+            "NAMES",
+            "Joined by commas, or all; else dt (or twin), ibg, ibg_rg.",
+            autocompletion=complete_sources,
+        ),
+    ] = None,
+    preset: Annotated[
+        str, option("NAME", "quick or paper: classifier, training, runs.", names=catalog.PRESETS)
+    ] = "quick",
     runs: Runs = None,
-    per_class: PerClass = None,
+    per_class: Annotated[
+        int | None, option("N", "Generated trajectories; else the case's.")
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
-    classifier: Classifier = None,
+    classifier: Annotated[
+        str | None,
+        rare("NAME", "cnn, lstm or rocket; else the preset's.", names=catalog.CLASSIFIERS),
+    ] = None,
     rate: Rate = None,
-    calibrate_on: CalibrateOn = "healthy",
-    random_onset: RandomOnset = False,
-    encoder_noise: EncoderNoise = 0.0,
-    learning_curve: LearningCurve = False,
-    processes: Processes = None,
+    calibrate_on: Annotated[
+        str, rare("NAME", "healthy or all.", names=catalog.CALIBRATE_ON)
+    ] = "healthy",
+    random_onset: Annotated[
+        bool, rare("", "Draw the onset of stuck motors.", "--random-onset")
+    ] = False,
+    encoder_noise: Annotated[float, rare("X", "Noise on frozen joints, in command units.")] = 0.0,
+    learning_curve: Annotated[
+        bool, rare("", "Also calibrate on 1, 2, 4, 6 … healthy ones.", "--learning-curve")
+    ] = False,
+    processes: Annotated[int | None, rare("N", "Jobs at a time; else one per core.")] = None,
     scheduler: Scheduler = None,
 ) -> None:
     """Compare updated twins with other sources on real trajectories."""
@@ -126,7 +119,8 @@ def study(
     if sources == "all":
         plan = replace(plan, sources=possible_sources(system, plan))
     found = StudyData(twin_data, calibration, test, real, data, mapping)
-    _run(system, plan, found, out, processes, scheduler, as_json=as_json)
+    where = {"processes": processes, "scheduler": scheduler}
+    _run(system, plan, found, out, as_json=as_json, **where)
 
 
 def report(
@@ -156,8 +150,7 @@ def demo(
     from retwin.study import StudyData, StudyPlan
     from retwin.update.surrogate import surrogate_training
 
-    data, folds = StudyData(), 2
-    folder = os.environ.get("RETWIN_DATA")
+    data, folder = StudyData(), os.environ.get("RETWIN_DATA")
     if folder:
         sets = Path(folder) / "armpi"
         names = [sets / name for name in ("real_a.mat", "my_dataset_test.mat")]
@@ -168,18 +161,7 @@ def demo(
         recorded = sets / "sim.mat"
         data = StudyData(twin=recorded if recorded.exists() else None, real=real)
     target = out or Path("demo", "real" if folder else "emulated")
-    plan = StudyPlan(
-        DEMO,
-        runs=runs,
-        seed=seed,
-        folds=folds,
-        per_class=DEMO_PER_CLASS,
-        emulated_healthy=DEMO_HEALTHY,
-        calibrated=DEMO_CALIBRATED,
-        simulated=DEMO_SIMULATED,
-        overlaid=DEMO_OVERLAID,
-        ablations=False,
-    )
+    plan = StudyPlan(DEMO, runs=runs, seed=seed, ablations=False, **DEMO_SETTINGS)
     titles = ", ".join(catalog.SOURCES[name].title for name in DEMO)
     kind = "real" if folder else "emulated"
     minutes = DEMO_MINUTES * plan.number_of_runs
@@ -191,41 +173,19 @@ def demo(
     note("or start with a twin and records of your own: retwin identify --help.")
 
 
-def _run(
-    case: Any,
-    plan: Any,
-    data: Any,
-    out: Path,
-    processes: int | None = None,
-    scheduler: str | None = None,
-    *,
-    as_json: bool,
-) -> None:
+def _run(case: Any, plan: Any, data: Any, out: Path, *, as_json: bool, **where: Any) -> None:
+    """Run a study `where` `run_study` is to run it, write its page, and print what it says."""
     from retwin.report import write_report
     from retwin.study import run_study
 
     with resumable(), bar("study") as show:
-        results = run_study(
-            case,
-            plan,
-            data,
-            out,
-            processes=processes,
-            scheduler=scheduler,
-            report=show,
-            command=command_given(),
-        )
+        given = command_given()
+        results = run_study(case, plan, data, out, report=show, command=given, **where)
         show("report", 0.99)
         page = write_report(out)
         show(FinishedStage("report"), 1.0)
-    answer(
-        _summary(results, page),
-        _title(results),
-        _uses(results),
-        "",
-        _table(results),
-        as_json=as_json,
-    )
+    shown = (_title(results), _uses(results), "", _table(results))
+    answer(_summary(results, page), *shown, as_json=as_json)
     note(f"Report: {page}")
 
 
@@ -267,14 +227,12 @@ def _table(results: Results) -> Table:
 
     sources, shown = results.sources, _metrics(results)
     titles = [COLUMNS[metric] for metric in shown]
-    made = table(
-        ("training data" if results.classes else "source", *titles),
-        [
-            (source_name(name), *(_over_runs(source.runs(metric)) for metric in shown))
-            for name, source in sources.items()
-        ],
-        numbers=titles,
-    )
+    rows = [
+        (source_name(name), *(_over_runs(source.runs(metric)) for metric in shown))
+        for name, source in sources.items()
+    ]
+    heads = ("training data" if results.classes else "source", *titles)
+    made = table(heads, rows, numbers=titles)
     for name, figures in results.published.items():
         cells = (f"  paper: {source_name(name)}", *(figures.get(metric, "") for metric in shown))
         made.add_row(*map(plain, cells), style="dim")

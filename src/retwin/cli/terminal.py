@@ -106,10 +106,7 @@ def answer(result: object, *shown: RenderableType, as_json: bool = False) -> Non
 
 
 def table(
-    columns: Sequence[str],
-    rows: Iterable[Sequence[object]],
-    *,
-    numbers: Sequence[str] = (),
+    columns: Sequence[str], rows: Iterable[Sequence[object]], *, numbers: Sequence[str] = ()
 ) -> Table:
     """A table of plain texts, which are folded on a narrow screen and never cut off.
 

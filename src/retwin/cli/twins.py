@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from retwin import twins
 from retwin.catalog import CASES, TWINS
@@ -12,15 +12,7 @@ from retwin.catalog.modules import known
 from retwin.checks import agree, given, require
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_faults, complete_twins
-from retwin.cli.films import (
-    Film,
-    FilmedId,
-    FilmSize,
-    FramesPerSecond,
-    Renderer,
-    draw_film,
-    film_settings,
-)
+from retwin.cli.films import draw_film, film_settings
 from retwin.cli.options import (
     Inputs,
     Json,
@@ -48,17 +40,8 @@ if TYPE_CHECKING:
     from retwin.twins.limits import Limits
     from retwin.twins.twin import Twin
 
-app = Commands(
-    help="List, describe and simulate twins.",
-    epilog=example("retwin twin info armpi"),
-)
+app = Commands(help="List, describe and simulate twins.", epilog=example("retwin twin info armpi"))
 
-TwinName = Annotated[
-    str,
-    argument(
-        "TWIN", "See `retwin twin info`; or a saved model's folder.", autocompletion=complete_twins
-    ),
-]
 Rate = Annotated[float | None, rare("HZ", "Samples per second.", min=1e-9)]
 
 RAMPS = 5
@@ -67,15 +50,6 @@ NoMeshes = Annotated[bool, rare("", "Leave out the meshes of a model file.", "--
 Servos = Annotated[
     list[str] | None, rare("JOINT=K,D", "Servo of a URDF's joint; repeatable.", "--servo")
 ]
-Count = Annotated[int | None, option("N", "Else one per command or class.", "--n")]
-CommandCase = Annotated[
-    str | None, option("CASE", "Draws commands and faults; else its own.", names=CASES)
-]
-CommandFile = Annotated[Path | None, option("FILE", "Trajectories with the commands.")]
-FaultName = Annotated[
-    str, option("NAME", "A class, all (in turn), or none.", autocompletion=complete_faults)
-]
-Duration = Annotated[float | None, rare("SECONDS", "Of commands that no case draws.", min=1e-9)]
 
 SHOWN = 100
 """Largest number of channels in a table: one of thousands takes minutes to lay out."""
@@ -91,8 +65,7 @@ OTHERS = {
 @app.command(epilog=example("retwin twin info armpi"))
 def info(
     twin: Annotated[
-        str | None,
-        argument("TWIN", "Else all are listed.", autocompletion=complete_twins),
+        str | None, argument("TWIN", "Else all are listed.", autocompletion=complete_twins)
     ] = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
@@ -167,19 +140,38 @@ def _ends(channel: dict[str, Any]) -> tuple[str, str]:
 
 @app.command(epilog=example("retwin twin simulate armpi --n 20000 --fault all --out made.zarr"))
 def simulate(
-    twin: TwinName,
+    twin: Annotated[
+        str,
+        argument(
+            "TWIN",
+            "See `retwin twin info`; or a saved model's folder.",
+            autocompletion=complete_twins,
+        ),
+    ],
     out: Annotated[Path | None, option("FILE", "New *.npz, or *.zarr of any size.")] = None,
-    n: Count = None,
-    case: CommandCase = None,
-    commands: CommandFile = None,
-    fault: FaultName = "none",
+    n: Annotated[int | None, option("N", "Else one per command or class.", "--n")] = None,
+    case: Annotated[
+        str | None, option("CASE", "Draws commands and faults; else its own.", names=CASES)
+    ] = None,
+    commands: Annotated[Path | None, option("FILE", "Trajectories with the commands.")] = None,
+    fault: Annotated[
+        str, option("NAME", "A class, all (in turn), or none.", autocompletion=complete_faults)
+    ] = "none",
     seed: Seed = 0,
-    film: Film = None,
-    name: FilmedId = None,
-    fps: FramesPerSecond = None,
-    size: FilmSize = None,
-    renderer: Renderer = None,
-    duration: Duration = None,
+    film: Annotated[
+        Path | None, option("FILE", "Film of --out, else of --commands: *.mp4 or *.gif.")
+    ] = None,
+    name: Annotated[
+        str | None, rare("ID", "The filmed trajectory; else the first.", "--id")
+    ] = None,
+    fps: Annotated[float | None, rare("HZ", "Pictures of the film per second; else 25.")] = None,
+    size: Annotated[str | None, rare("WxH", "Of the film; else 640x480.")] = None,
+    renderer: Annotated[
+        Literal["mujoco", "stick"] | None, rare("", "What draws; else the best here.")
+    ] = None,
+    duration: Annotated[
+        float | None, rare("SECONDS", "Of commands that no case draws.", min=1e-9)
+    ] = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
@@ -220,7 +212,7 @@ def simulate(
         carry_out(plan, out, "simulate", workers=workers, scheduler=scheduler)
     if film is not None and filmed is not None:
         trajectories = read(filmed, system, max_bytes=max_bytes)
-        draw_film(film, trajectories, found, system, settings, seed)
+        draw_film(film, trajectories, found, system, {"seed": seed, **settings})
 
 
 def _twin(

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from retwin.catalog import DOWNLOADS, PublicFile
 from retwin.checks import needs_extra, require
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256 as sha256_of
+from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place
 from retwin.serialisation.sizes import Budget
 
@@ -85,32 +83,23 @@ def fetch(
     if os.path.isfile(target) and sha256_of(target) == known.sha256:
         return target
     check_place(target)
-    pooch = needs_extra("pooch", "fetch", "downloads public files")
+    needs_extra("requests", "fetch", "downloads public files")
     try:
-        with _quiet(pooch.get_logger()):
-            pooch.retrieve(
-                known.url,
-                known_hash=f"sha256:{known.sha256}",
-                fname=target.name,
-                path=target.parent,
-                downloader=_downloader(Budget(name, max_bytes), progress),
-            )
-    except InputError:
-        _tidy(target.parent, place)
-        raise
+        with write_atomically(target) as part:
+            _download(Transfer(known.url, part, Budget(name, max_bytes)), progress)
+            if sha256_of(part) != known.sha256:
+                raise RuntimeError(
+                    f"fetch {name}: what {known.url} gave does not have the SHA-256 "
+                    f"{known.sha256}, so it was thrown away; try again, or give another url"
+                )
     except OSError as error:
-        _tidy(target.parent, place)
         reason = " ".join(str(error).split())[:200]
         raise OSError(
             f"fetch {name}: cannot get {known.url} into {place} ({reason}); check the network, or "
             f"put the file there by hand as {known.file}"
         ) from None
-    except ValueError:
+    finally:
         _tidy(target.parent, place)
-        raise RuntimeError(
-            f"fetch {name}: what {known.url} gave does not have the SHA-256 {known.sha256}, so it "
-            "was thrown away; try again, or give another url"
-        ) from None
     return target
 
 
@@ -147,37 +136,32 @@ def _tidy(folder: Path, place: Path) -> None:
             folder.rmdir()
 
 
-def _downloader(
-    budget: Budget, progress: Progress | None, *, seconds_per_report: float = 0.1
-) -> Callable[[str, str | os.PathLike[str], Any], None]:
-    """A downloader for pooch, whose own one has no limits.
+def _download(
+    transfer: Transfer, progress: Progress | None, *, seconds_per_report: float = 0.1
+) -> None:
+    """Wait for a transfer, for `MAX_SECONDS` at most.
 
     Parameters
     ----------
     seconds_per_report : float, default 0.1
-        Seconds between two reports of progress.
+        Time between two looks at the transfer.
 
     """
-
-    def download(url: str, output: str | os.PathLike[str], _: Any) -> None:
-        transfer = Transfer(url, output, budget)
-        deadline = time.monotonic() + MAX_SECONDS
-        transfer.start()
-        try:
-            while transfer.is_alive():
-                transfer.join(seconds_per_report)
-                if progress is not None and transfer.share:
-                    progress(transfer.share)
-                if time.monotonic() > deadline:
-                    raise OSError(f"not complete after {MAX_SECONDS:g} s")
-        finally:
-            transfer.abandoned = True
-        if transfer.error is not None:
-            raise transfer.error
-        if progress is not None:
-            progress(1.0)
-
-    return download
+    deadline = time.monotonic() + MAX_SECONDS
+    transfer.start()
+    try:
+        while transfer.is_alive():
+            transfer.join(seconds_per_report)
+            if progress is not None and transfer.share:
+                progress(transfer.share)
+            if time.monotonic() > deadline:
+                raise OSError(f"not complete after {MAX_SECONDS:g} s")
+    finally:
+        transfer.abandoned = True
+    if transfer.error is not None:
+        raise transfer.error
+    if progress is not None:
+        progress(1.0)
 
 
 class Transfer(threading.Thread):
@@ -240,14 +224,3 @@ class Transfer(threading.Thread):
                     self.share = min(1.0, file.tell() / size) if size else 0.0
             except HTTPError as error:
                 raise OSError(str(error)) from None
-
-
-@contextmanager
-def _quiet(logger: logging.Logger) -> Iterator[None]:
-    """Silence pooch's log during this download."""
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)

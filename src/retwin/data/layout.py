@@ -156,21 +156,12 @@ def text_layout(
     for at, name in enumerate(names):
         seen[name] = seen.get(name, 0) + 1
         names[at] = name if seen[name] == 1 else f"{name}.{seen[name]}"
-    layout = Layout(
-        encoding,
-        separator,
-        first,
-        tuple(title.strip() for title in titles),
-        tuple(names),
-        tuple(unit or other for unit, (_, other) in zip(own, pairs, strict=True)),
-    )
-    missing = [each for each in wanted if each not in (*layout.titles, *names)]
-    nothing(
-        place,
-        (f"no column {each}" for each in missing),
-        f"a header with the columns {', '.join(wanted)}",
-        remedy="name the columns as the file does",
-    )
+    every = tuple(unit or other for unit, (_, other) in zip(own, pairs, strict=True))
+    stripped = tuple(title.strip() for title in titles)
+    layout = Layout(encoding, separator, first, stripped, tuple(names), every)
+    missing = [f"no column {each}" for each in wanted if each not in (*layout.titles, *names)]
+    expected = f"a header with the columns {', '.join(wanted)}"
+    nothing(place, missing, expected, remedy="name the columns as the file does")
     return layout
 
 

@@ -74,12 +74,7 @@ class Provenance:
     def of(cls, values: Mapping[str, Any]) -> Provenance:
         """What `plain` gave."""
         known = {each.name for each in fields(Sampling)}
-        return cls(
-            values["name"],
-            values["sha256"],
-            tuple(
-                Sampling(**{key: value for key, value in each.items() if key in known})
-                for each in values.get("sampling", ())
-            ),
-            tuple(map(str, values.get("notes", ()))),
-        )
+        every = values.get("sampling", ())
+        kept = ({key: value for key, value in each.items() if key in known} for each in every)
+        sampling, notes = tuple(Sampling(**each) for each in kept), values.get("notes", ())
+        return cls(values["name"], values["sha256"], sampling, tuple(map(str, notes)))

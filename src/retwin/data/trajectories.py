@@ -201,6 +201,11 @@ class Trajectories:
         return found
 
     @property
+    def measured(self) -> NDArray:
+        """Observed outputs (n, T, d_y), NaN where nothing was measured."""
+        return np.where(self.mask, self.observed, np.nan)
+
+    @property
     def residual(self) -> NDArray:
         """Observed minus nominal outputs (n, T, d_y), Eq. 11; 0 where nothing was measured."""
         return np.where(self.mask, self.observed - self.nominal, 0).astype(self.nominal.dtype)

@@ -20,8 +20,8 @@ from retwin.cases.updated_case import updated_case
 from retwin.data.io import save
 from retwin.data.quality.check import Checked
 from retwin.errors import InputError
-from retwin.evaluation.identification import Identification
 from retwin.evaluation.identification.parameters import spread_of
+from retwin.evaluation.identification.validation import Identification
 from retwin.report.identification import identification_page
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place

@@ -16,7 +16,8 @@ _HOME = homes(
         "experiments.propose": "Proposal next_experiments",
         "fidelity": "Fidelity Figure Overlay Simulation measure_fidelity measure_widening "
         "predictive_overlay record_means simulate_records simulation_scores",
-        "identification": "Identification hold_out validate_identification",
+        "identification.hold_out": "hold_out",
+        "identification.validation": "Identification validate_identification",
     }
 )
 

@@ -256,10 +256,13 @@ def bar(edges: NDArray, shares: NDArray, name: str, colour: str) -> Line:
     return Line(*outline(edges, shares), name, colour, width=0, filled=True)
 
 
-def record_panel(times: NDArray, name: str, unit: str, marks: Sequence[Mark]) -> Panel:
-    """An output over time."""
-    x = Axis("time", "s", (float(times[0]), float(times[-1])), count=8)
-    return Panel(x, [Row(Axis(name, unit), marks)], f"{name} over time", name, height=300)
+def record_panel(
+    times: NDArray, name: str, unit: str, marks: Sequence[Mark], title: str = "", height: int = 300
+) -> Panel:
+    """A channel over time, by default with its name as the title."""
+    title, count = title or name, 4 if height < 300 else 8
+    x = Axis("time", "s", (float(times[0]), float(times[-1])), count=count)
+    return Panel(x, [Row(Axis(name, unit), marks)], f"{title} over time", title, height=height)
 
 
 def envelope(mark: Mark) -> Mark:

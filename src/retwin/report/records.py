@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from retwin.data.quality.check import Checked
-from retwin.data.quality.finding import NAMED, Finding
+from retwin.data.quality.finding import NAMED, Finding, group_alike
 from retwin.data.trajectories import Trajectories
 from retwin.report.blocks import Table, tabulate, text_column
-from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, Spans
+from retwin.report.figure import Figure, Key, Line, Mark, Panel, Spans, record_panel
 
 TITLE = "What your records look like"
 """The heading on the terminal and on pages."""
@@ -46,11 +45,8 @@ def finding_rows(findings: Sequence[Finding]) -> list[tuple[str, str, str, str]]
     Those of one kind in one channel are a row, with the figures of the first; a few with times of
     their own are not.
     """
-    alike: dict[tuple[str, str], list[Finding]] = {}
-    for each in findings:
-        alike.setdefault((each.kind, each.channel), []).append(each)
     rows = []
-    for own in alike.values():
+    for own in group_alike(findings):
         if len(own) == 1 or (own[0].time and len(own) <= NAMED):
             rows += [each.row for each in own]
         else:
@@ -91,22 +87,16 @@ def _panel(checked: Checked, row: int, channel: str) -> Panel:
     if channel in records.inputs.names:
         k, unit = records.inputs.names.index(channel), records.inputs.units
         marks.append(Line(times, records.commands[row, :length, k], "measured", "ink"))
-        return _framed(times, record, channel, unit[k], marks)
+        return record_panel(times, channel, unit[k], marks, f"{record}: {channel}", 180)
     k = records.outputs.names.index(channel) if channel else _moving(records, row)
-    values = np.where(records.mask[row, :length, k], records.observed[row, :length, k], np.nan)
-    marks.append(Line(times, values, "measured", "ink", width=1.4))
+    marks.append(Line(times, records.measured[row, :length, k], "measured", "ink", width=1.4))
     if checked.explained:
         marks.insert(0, Line(times, records.nominal[row, :length, k], "twin", "c0", alpha=0.7))
-    return _framed(times, record, records.outputs.names[k], records.outputs.units[k], marks)
+    name = records.outputs.names[k]
+    return record_panel(times, name, records.outputs.units[k], marks, f"{record}: {name}", 180)
 
 
 def _moving(records: Trajectories, row: int) -> int:
     spread = np.ptp(records.observed, axis=(0, 1))
     own = np.ptp(records.observed[row], axis=0)
     return int(np.argmax(np.divide(own, spread, out=np.zeros_like(own), where=spread > 0)))
-
-
-def _framed(times: NDArray, record: str, name: str, unit: str, marks: Sequence[Mark]) -> Panel:
-    x = Axis("time", "s", (float(times[0]), float(times[-1])), count=4)
-    title = f"{record}: {name}"
-    return Panel(x, [Row(Axis(name, unit), marks)], f"{title} over time", title, height=180)

@@ -10,12 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
-from retwin.scores.residuals import (
-    autocorrelation,
-    cross_correlation,
-    decorrelated_after,
-    spectra,
-)
+from retwin.scores.residuals import autocorrelation, cross_correlation, decorrelated_after, spectra
 
 POINTS = 241
 """Lags that a figure shows, at most."""
@@ -78,13 +73,9 @@ def _autocorrelation_panel(errors: Errors, rate: float) -> Panel:
     x = first.lags / rate
     marks: list[Mark] = [Band(x, -first.limits, first.limits, WHITE.text, "muted", 0.25)]
     marks += [line(x, each.values, key) for key, each in found.items()]
-    return Panel(
-        Axis("lag", "s"),
-        [Row(Axis("autocorrelation", limits=(-1.05, 1.05), step=0.5), marks)],
-        f"Autocorrelation of the error of {errors.output.name}",
-        errors.output.name,
-        height=300,
-    )
+    y, name = Axis("autocorrelation", limits=(-1.05, 1.05), step=0.5), errors.output.name
+    alt = f"Autocorrelation of the error of {name}"
+    return Panel(Axis("lag", "s"), [Row(y, marks)], alt, name, height=300)
 
 
 def _cross_correlation_panel(errors: Errors, command: ChannelRecords, rate: float) -> Panel:
@@ -99,13 +90,9 @@ def _cross_correlation_panel(errors: Errors, command: ChannelRecords, rate: floa
         both = np.concatenate([np.abs(found.values), found.limits])
         largest = float(max(largest, *both[np.isfinite(both)], 0.0))
     y = Axis("correlation", limits=(-1.1 * largest, 1.1 * largest) if largest > 0 else None)
-    return Panel(
-        Axis("time by which the command is earlier", "s"),
-        [Row(y, marks)],
-        f"Correlation of the error of {errors.output.name} with {command.name}",
-        f"{errors.output.name}, {command.name}",
-        height=300,
-    )
+    time, name = Axis("time by which the command is earlier", "s"), errors.output.name
+    alt = f"Correlation of the error of {name} with {command.name}"
+    return Panel(time, [Row(y, marks)], alt, f"{name}, {command.name}", height=300)
 
 
 def _spectrum_panel(errors: Errors, rate: float) -> Panel | None:
@@ -118,13 +105,10 @@ def _spectrum_panel(errors: Errors, rate: float) -> Panel | None:
     for key, each in zip(errors.by_key, others, strict=True):
         marks.append(line(frequencies, np.sqrt(each), key))
     unit = f"{output.unit or 1}/√Hz"
-    return Panel(
-        log_axis("frequency", "Hz", frequencies),
-        [Row(log_axis("spectral density", unit, np.sqrt([signal, *others])), marks)],
-        f"Spectrum of {output.name} and of its errors",
-        output.name,
-        height=340,
-    )
+    x = log_axis("frequency", "Hz", frequencies)
+    y = log_axis("spectral density", unit, np.sqrt([signal, *others]))
+    alt = f"Spectrum of {output.name} and of its errors"
+    return Panel(x, [Row(y, marks)], alt, output.name, height=340)
 
 
 def log_axis(label: str, unit: str, values: object) -> Axis:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from retwin.report.labels import order, quantities
 from retwin.results import FidelityResults, Results, read_results
 from retwin.results.sources import SourceResults
 from retwin.scores.decisions import Decision, decide
+from retwin.scores.histograms import Histogram, common_histogram
 from retwin.scores.uses import uses_of
 
 AGAIN = "run `retwin study` with this folder as --out again"
@@ -36,6 +38,11 @@ class Component:
     unit: str
     observed: NDArray
     predicted: NDArray
+
+    @cached_property
+    def values(self) -> Histogram | None:
+        """Both in common bins; None where there are none."""
+        return common_histogram(self.observed, self.predicted)
 
 
 @dataclass(frozen=True)

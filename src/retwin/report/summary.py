@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -62,24 +61,16 @@ def learned(study: Study) -> Table | None:
     The mean over trajectories of each component of z, its 95 % interval over trajectories, and the
     range of single segments.
     """
-    rows: dict[str, _Row] = {}
+    rows: dict[str, tuple[list[str], int]] = {}
     for component in (*_segment_values(study), *_held_out_values(study)):
         name, row = component[0], _row(*component)
         # Of a component that both have, the one that more segments identify.
-        if row and (name not in rows or row.count > rows[name].count):
+        if row and (name not in rows or row[1] > rows[name][1]):
             rows[name] = row
     heads = ["Quantity", "Mean", "95 % interval", "Range of 90 % of the segments"]
     heads += ["Generated mean", "Segments"]
-    cells = [row.cells for row in rows.values()]
+    cells = [[learned_name(name), *texts, str(count)] for name, (texts, count) in rows.items()]
     return tabulate("What was learned", heads, cells).without_empty() if rows else None
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A row of the table, and the number of segments that identify it."""
-
-    cells: list[str]
-    count: int
 
 
 Values = Iterator[tuple[str, str, NDArray, float | None]]
@@ -118,8 +109,10 @@ def _held_out_values(study: Study) -> Values:
         yield each.name, each.unit, np.array(padded), mean
 
 
-def _row(name: str, unit: str, values: NDArray, generated: float | None) -> _Row | None:
-    """A row from `Values`; None where nothing is identified."""
+def _row(
+    name: str, unit: str, values: NDArray, generated: float | None
+) -> tuple[list[str], int] | None:
+    """Texts of `Values`, and how many segments identify them; None where nothing is identified."""
     values = values[np.isfinite(values).any(axis=1)]
     if not len(values):
         return None
@@ -128,8 +121,7 @@ def _row(name: str, unit: str, values: NDArray, generated: float | None) -> _Row
     if name.startswith("missed"):
         hits = np.nansum(values, axis=1)
         ends = grouped_share_interval(hits, counts)
-        texts = [percent(float(hits.sum() / total), 1), percents(ends), "–", "–"]
-        return _Row([learned_name(name), *texts, str(total)], total)
+        return [percent(float(hits.sum() / total), 1), percents(ends), "–", "–"], total
     means = np.nanmean(values, axis=1)
     ends = jackknife_interval(lambda weights: weights @ means, len(means))
     low, high = np.quantile(single, [0.05, 0.95])
@@ -141,8 +133,7 @@ def _row(name: str, unit: str, values: NDArray, generated: float | None) -> _Row
         span((low, high) if total >= SEGMENTS else None, digits),
         number(generated, digits),
     ]
-    texts = [text if text == "–" else behind(text, unit) for text in texts]
-    return _Row([learned_name(name), *texts, str(total)], total)
+    return [text if text == "–" else behind(text, unit) for text in texts], total
 
 
 def picture(study: Study) -> Figure | None:

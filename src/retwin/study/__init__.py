@@ -172,14 +172,9 @@ def _check_free(out: Path, expected: Mapping[str, Any]) -> None:
 def _check_possible(case: Case, plan: StudyPlan) -> None:
     """Refuse, before hours of work, what the case or the classifier does not permit."""
     if plan.rate is not None:
-        finite(
-            "rate",
-            plan.rate,
-            at_least=2 * case.rate / case.sampler.steps,
-            at_most=case.rate,
-            unit="Hz",
-            remedy="give one between two samples per trajectory and the rate of the data",
-        )
+        least, remedy = 2 * case.rate / case.sampler.steps, "give one between two samples per "
+        remedy += "trajectory and the rate of the data"
+        finite("rate", plan.rate, at_least=least, at_most=case.rate, unit="Hz", remedy=remedy)
     require(
         plan.encoder_noise == 0 or case.encoder_noise is not None,
         "encoder_noise",

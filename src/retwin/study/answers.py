@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, TypeAlias
@@ -15,7 +14,7 @@ from retwin.data.quality.finding import Finding
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.labels import find_wrong_labels
 from retwin.diagnosis.trained.pooled import pool_probabilities
-from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
+from retwin.evaluation.fidelity.simulation import Simulation, record_means, simulation_scores
 from retwin.scores.bootstrap import Draws, Resampling, bootstrap_means
 from retwin.scores.classification import METRICS, confusion, score
 from retwin.study.estimates import read_estimates
@@ -199,19 +198,17 @@ class SimulatedRecords:
         found = {
             "commands": self._records.commands,
             "nominal": self._records.nominal,
-            "observed": np.where(self._records.mask, self._records.observed, np.nan),
+            "observed": self._records.measured,
         }
         for name in self.work.plan.sources:
             first = self._runs(name)[0]
             found |= {f"{name}/mean": first.mean}
             if first.random:
                 found |= {f"{name}/bands": first.bands}
-        single: Mapping[str, NDArray] = {
-            key: each.astype(np.float32) for key, each in found.items()
-        }
-        about = {"ids": self._records.ids, "rate": np.array(self._records.rate)}
-        about |= {"range": self._range()}
-        made = {f"simulation/{name}": each for name, each in {**single, **about}.items()}
+        made = {f"simulation/{name}": each.astype(np.float32) for name, each in found.items()}
+        made["simulation/ids"] = self._records.ids
+        made["simulation/rate"] = np.array(self._records.rate)
+        made["simulation/range"] = self._range()
         return made | (self._curves() if "dynamics" in self.work.plan.sources else {})
 
     def _range(self) -> NDArray:
@@ -219,7 +216,7 @@ class SimulatedRecords:
         real, ends = self.work.files.real_data(), []
         for calibration, _ in self.work.roles.folds:
             own = real[list(calibration)]
-            both = [own.commands, np.where(own.mask, own.observed, np.nan)]
+            both = [own.commands, own.measured]
             flat = np.concatenate(both, axis=2).reshape(-1, sum(each.shape[2] for each in both))
             ends.append([np.fmin.reduce(flat), np.fmax.reduce(flat)])
         low, high = np.moveaxis(np.array(ends), 1, 0)

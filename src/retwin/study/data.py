@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from retwin.cases.case import Case
 from retwin.checks import nothing, require
@@ -96,10 +95,7 @@ def real_data(
 
     def read(path: Path) -> Trajectories:
         found = load(
-            path,
-            case=case,
-            progress=lambda share: report(path.name, share),
-            mapping=data.mapping,
+            path, case=case, progress=lambda share: report(path.name, share), mapping=data.mapping
         )
         return _labelled(found, case, path.name)
 
@@ -122,7 +118,7 @@ def real_data(
             remedy="give --real FILE --folds K",
         )
     # Copies have no role: a fold would be tested by what the others were calibrated on.
-    first = _first(real)
+    first = distinct_records(real.measured)
     folds = real[first].folds(plan.folds, seed=plan.seed_of("folds", 0))
     return real, Roles.of((first[fit], first[test]) for fit, test in folds)
 
@@ -160,7 +156,7 @@ def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories
     ids = [*calibration.ids.tolist(), *test.ids.tolist()]
     shared = [
         f"{ids[i]}, which is {ids[j]} of the calibration"
-        for i, j, _ in find_copies(_measured(both))
+        for i, j, _ in find_copies(both.measured)
         if j < count <= i
     ]
     require(
@@ -170,18 +166,8 @@ def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories
         got="; ".join(shared[:3]) + (f"; {len(shared)} in all" if len(shared) > 3 else ""),
         remedy="leave them out of one of both sets",
     )
-    first = _first(both)
+    first = distinct_records(both.measured)
     return both, Roles.of([(first[first < count], first[first >= count])])
-
-
-def _measured(trajectories: Trajectories) -> NDArray:
-    """Outputs (n, T, d_y), NaN where nothing was measured."""
-    return np.where(trajectories.mask, trajectories.observed, np.nan)
-
-
-def _first(trajectories: Trajectories) -> NDArray:
-    """Indices of the trajectories that are no copies of earlier ones."""
-    return distinct_records(_measured(trajectories))
 
 
 def _labelled(trajectories: Trajectories, case: Case, name: str) -> Trajectories:

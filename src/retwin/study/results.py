@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from retwin.catalog import METRICS, SOURCES
 from retwin.data.quality.check import Checked
-from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.evaluation.fidelity import Fidelity, Overlay
+from retwin.data.trajectories import HEALTHY, PER_SAMPLE, Trajectories
+from retwin.evaluation.fidelity.figures import Fidelity
+from retwin.evaluation.fidelity.overlay import Overlay
 from retwin.results import SCHEMA, Results
 from retwin.results.sources import CurvePoint, SourceResults
 from retwin.scores.bootstrap import Draws
@@ -70,7 +71,7 @@ def write_results(
     if overlay is not None:
         known = set(overlay.ids.tolist())
         shown_test = test[[name in known for name in test.ids.tolist()]]
-        arrays |= _overlay_arrays(work, shown_test, overlay) | _poses(work, shown_test, overlay)
+        arrays |= _overlay_arrays(work, shown_test, overlay)
         shown["portrait"] = {
             "source": work.overlay_jobs()[0].name,
             "ids": shown_test.ids.tolist(),
@@ -232,19 +233,10 @@ def _comparisons(
                 difference = np.subtract(ours, theirs).tolist()
                 each = each.with_runs(difference, seed=seed, largest=largest)
             if each.interval is not None:
-                rows.append(
-                    {
-                        "a": a,
-                        "b": b,
-                        "metric": metric,
-                        **compare_runs(ours, theirs),
-                        "p_holm": None,
-                        "bootstrap_ci95": each.interval,
-                        "p_bootstrap": each.p,
-                        "p_verdict": None,
-                        "no_verdict": reason,
-                    }
-                )
+                row: dict[str, Any] = {"a": a, "b": b, "metric": metric}
+                row |= compare_runs(ours, theirs)
+                row |= {"bootstrap_ci95": each.interval, "p_bootstrap": each.p}
+                rows.append({**row, "p_holm": None, "p_verdict": None, "no_verdict": reason})
         _adjust([row for row in rows if row["metric"] in found.family], "p", "p_holm")
         out += rows
     for metric in found.compared:
@@ -345,47 +337,30 @@ def _overlay_arrays(work: Work, test: Trajectories, overlay: Overlay) -> dict[st
     """The simulated test trajectories at the sensor's rate, in the order of `data.test.ids`.
 
     `portrait/commands` (n, P, d_u), `/nominal`, `/observed` (n, P, d), the latter NaN where not
-    measured, and `/rate` in Hz; the rest as in `Overlay`.
-    """
-    every = max(1, round(test.rate / work.case.sensor_rate))
-    names = overlay.ids.tolist()
-    order = [names.index(name) for name in test.ids.tolist()]
-    found = {
-        "commands": test.commands[:, ::every],
-        "nominal": test.nominal[:, ::every],
-        "observed": np.where(test.mask, test.observed, np.nan)[:, ::every],
-        **{name: getattr(overlay, name)[order] for name in ("bands", "z", "deviation", "times")},
-        "rate": np.array(test.rate / every),
-    }
-    return {f"portrait/{name}": each.astype(np.float32) for name, each in found.items()}
-
-
-def _poses(work: Work, test: Trajectories, overlay: Overlay | None = None) -> dict[str, NDArray]:
-    """Skeletons of the simulated test trajectories at the sensor's rate.
-
+    measured, and `/rate` in Hz; the rest as in `Overlay`. Of a case with a body the skeletons
     `pose/nominal`, `pose/observed` and, of the median of the updated twin's draws, `pose/updated`
     (n, P, points, 3) in m.
     """
-    body = work.case.body
-    if body is None:
-        return {}
     every = max(1, round(test.rate / work.case.sensor_rate))
-    names = ("commands", "nominal", "observed", "mask")
-    slow = Trajectories(
-        **{name: getattr(test, name)[:, ::every] for name in names},
-        rate=test.rate / every,
-        inputs=test.inputs,
-        outputs=test.outputs,
-    )
-    nominal, observed = map(body.skeleton, body.poses(slow))
-    found = {"pose/nominal": nominal, "pose/observed": observed}
-    if overlay is not None:
-        ids = overlay.ids.tolist()
-        order = [ids.index(name) for name in test.ids.tolist()]
-        median = overlay.bands[order, 2].astype(slow.observed.dtype)
+    arrays = {name: getattr(test, name)[:, ::every] for name in PER_SAMPLE}
+    slow = test.replace(**arrays, rate=test.rate / every)
+    names = overlay.ids.tolist()
+    order = [names.index(name) for name in test.ids.tolist()]
+    found = {
+        "commands": slow.commands,
+        "nominal": slow.nominal,
+        "observed": slow.measured,
+        **{name: getattr(overlay, name)[order] for name in ("bands", "z", "deviation", "times")},
+        "rate": np.array(slow.rate),
+    }
+    made = {f"portrait/{name}": each for name, each in found.items()}
+    if (body := work.case.body) is not None:
+        median = found["bands"][:, 2].astype(slow.observed.dtype)
         predicted = slow.replace(observed=median, mask=np.ones(median.shape, dtype=bool))
-        found["pose/updated"] = body.skeleton(body.poses(predicted)[1])
-    return {name: each.astype(np.float32) for name, each in found.items()}
+        poses = (*body.poses(slow), body.poses(predicted)[1])
+        for name, each in zip(("nominal", "observed", "updated"), poses, strict=True):
+            made[f"pose/{name}"] = body.skeleton(each)
+    return {name: each.astype(np.float32) for name, each in made.items()}
 
 
 def _machine() -> dict[str, str]:

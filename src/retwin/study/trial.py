@@ -197,13 +197,8 @@ class Trial:
 
     def generate(self, twin: Twin) -> Trajectories:
         """A labelled training set, with the same commands and faults for all sources of a run."""
-        made = generate(
-            twin,
-            self.case,
-            per_class=self.plan.generated(self.case),
-            seed=self.seed("generate"),
-            onsets=self.onsets,
-        )
+        case, seed, count = self.case, self.seed("generate"), self.plan.generated(self.case)
+        made = generate(twin, case, per_class=count, seed=seed, onsets=self.onsets)
         return self._noisy(made, self.seed("encoder noise in training"))
 
     @property

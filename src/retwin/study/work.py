@@ -25,12 +25,9 @@ from retwin.diagnosis import FittedDiagnoser
 from retwin.evaluation.choice import Choice, fit
 from retwin.evaluation.choice.surrogates import SurrogateSettings, stand_in
 from retwin.evaluation.diagnosers import finite_probabilities
-from retwin.evaluation.fidelity import (
-    measure_fidelity,
-    measure_widening,
-    predictive_overlay,
-    simulate_records,
-)
+from retwin.evaluation.fidelity.measure import measure_fidelity, measure_widening
+from retwin.evaluation.fidelity.overlay import predictive_overlay
+from retwin.evaluation.fidelity.simulation import simulate_records
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import save_model
@@ -169,22 +166,14 @@ class Work:
         """Labels of all real trajectories."""
         return self.files.real_data().labels
 
-    # The work of each job.
+    # The work of each job, by a method for each kind of job.
 
     def do(self, job: Job, progress: Progress | None = None) -> None:
         """Make the result of a job, unless it exists; record its costs, its warnings among them."""
         path = self.files.path(job)
         if path.exists():
             return
-        make = {
-            "surrogate": self._surrogate,
-            "residual": self._residual,
-            "update": self._update,
-            "diagnosis": self._diagnosis,
-            "simulation": self._simulation,
-            "fidelity": self._fidelity,
-            "portrait": self._overlay,
-        }[job.kind]
+        make = getattr(self, f"_{job.kind}")
         started = time.perf_counter()
         with warnings.catch_warnings(record=True) as given:
             warnings.simplefilter("always", UserWarning)
@@ -252,9 +241,9 @@ class Work:
             base = stand_in(twin, trial.healthy, how, seed=seed, progress=progress).twin
             if trial.job.name == "fit":
                 settings, original = Choice.of(case), twin if isinstance(base, Surrogate) else None
-                found = fit(base, trial.healthy, settings, seed=seed, original=original)
-                found.twin.save(path)
-                return {"notes": f"chosen: {CANDIDATES[found.chosen]}"}
+                taken = fit(base, trial.healthy, settings, seed=seed, original=original)
+                taken.twin.save(path)
+                return {"notes": f"chosen: {CANDIDATES[taken.chosen]}"}
             made = fit_dynamics(
                 base,  # type: ignore[arg-type]  # it has state equations
                 trial.healthy,
@@ -264,8 +253,13 @@ class Work:
             made.twin.save(path)
             write_estimates(path, made)
             return {"notes": made.reason}
-        bayes = trial.job.name == "pi_bayes"
-        found = _bayes(trial, path) if bayes else _least_squares(trial, path)
+        found: Updated | Posterior
+        if trial.job.name == "pi_bayes":
+            found = identify(trial.parametric, trial.healthy, NPE(), **trial.updating)
+            found.twin.save(path)
+        else:
+            found = updated = identify(trial.parametric, trial.healthy, **trial.updating)
+            save_model(path, "parameters", {"values": updated.values}, {})
         # A search that was cut off is noted; one that converged is no failure.
         cut_off = [each for each in found.reason.split("; ") if "exceeded" in each]
         return {"twin_runs": found.twin_runs, "notes": "; ".join(cut_off)}
@@ -316,19 +310,12 @@ class Work:
         corrected = any(kind == "residual" for kind, _ in SOURCES[trial.job.name].needs)
         if self.plan.ablations and corrected and isinstance(twin, CorrectedTwin) and twin.random:
             rivals, widening = self._rivals(trial, twin), self._widening(trial)
-        found = measure_fidelity(
-            twin,
-            healthy,
-            seed=trial.seed("fidelity"),
-            rate=self.case.sensor_rate,
-            against=rivals,
-            widening=widening,
-            progress=trial.progress,
-        )
-        found.save(path)
+        seed, rate = trial.seed("fidelity"), self.case.sensor_rate
+        compared: Any = {"against": rivals, "widening": widening, "progress": trial.progress}
+        measure_fidelity(twin, healthy, seed=seed, rate=rate, **compared).save(path)
         return {}
 
-    def _overlay(self, trial: Trial, path: Path) -> Costs:
+    def _portrait(self, trial: Trial, path: Path) -> Costs:
         """The predictive overlay of the fold's test trajectories, for display and no score."""
         labels = np.unique(self._labels[list(trial.fold[1])])
         shown = {i for label in labels for i in self._simulated(trial, label)}
@@ -383,11 +370,7 @@ class Work:
         return name
 
     def _fitted(
-        self,
-        trial: Trial,
-        calibration: Trajectories,
-        name: str,
-        density: Density | SequenceMixture,
+        self, trial: Trial, calibration: Trajectories, name: str, density: Density | SequenceMixture
     ) -> Residual:
         faults: Mapping[str, Fault | None] = self.case.faults
         return fit_residual(
@@ -403,18 +386,6 @@ class Work:
 
     def _calibration(self, trial: Trial) -> Trajectories:
         return trial.labelled if self._uses_labels else trial.healthy
-
-
-def _least_squares(trial: Trial, path: Path) -> Updated:
-    found = identify(trial.parametric, trial.healthy, **trial.updating)
-    save_model(path, "parameters", {"values": found.values}, {})
-    return found
-
-
-def _bayes(trial: Trial, path: Path) -> Posterior:
-    found = identify(trial.parametric, trial.healthy, NPE(), **trial.updating)
-    found.twin.save(path)
-    return found
 
 
 def _source_twin(trial: Trial) -> Any:

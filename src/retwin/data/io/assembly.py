@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,13 @@ class Raw:
     id: str | None = None
     rate: float | None = None
 
+    @property
+    def blocks(self) -> dict[str, NDArray]:
+        """Its arrays by name; commands (T, 0) where the file holds none."""
+        none = np.zeros((len(self.nominal), 0), self.nominal.dtype)
+        commands = none if self.commands is None else self.commands
+        return {"nominal": self.nominal, "observed": self.observed, "commands": commands}
+
     @classmethod
     def of_columns(
         cls, block: NDArray, where: str, case: DataCase | None, label: str, name: str | None = None
@@ -94,25 +101,15 @@ class Raw:
 def _widths(width: int, where: str, case: DataCase | None) -> tuple[int, int]:
     """The number of columns of commands, 0 if there are none, and of outputs."""
     if case is None:
-        half, odd = divmod(width, 2)
-        require(
-            half and not odd,
-            where,
-            expected="an even number of columns, nominal outputs then observed ones",
-            got=f"{width} columns",
-            remedy="give the case when commands come first",
-        )
-        first = 0
+        first, (half, odd) = 0, divmod(width, 2)
+        fine, remedy = half and not odd, "give the case when commands come first"
+        expected = "an even number of columns, nominal outputs then observed ones"
     else:
         half, first = len(case.outputs), width - 2 * len(case.outputs)
-        require(
-            first in (0, len(case.inputs)),
-            where,
-            expected=f"{2 * half} columns (nominal, observed) or "
-            f"{len(case.inputs) + 2 * half} (commands, nominal, observed)",
-            got=f"{width} columns",
-            remedy="give the case that the data belong to",
-        )
+        fine, remedy = first in (0, len(case.inputs)), "give the case that the data belong to"
+        expected = f"{2 * half} columns (nominal, observed) or "
+        expected += f"{len(case.inputs) + 2 * half} (commands, nominal, observed)"
+    require(fine, where, expected=expected, got=f"{width} columns", remedy=remedy)
     return first, half
 
 
@@ -158,26 +155,18 @@ def assemble(
             got="commands in some trajectories only",
             remedy="split the data into two sets",
         )
-        for name in ("nominal", "observed", "commands"):
-            _same_width(name, raw, first)
+        for name, block in raw.blocks.items():
+            _check_block(name, block, raw, first)
     steps = max(len(raw.nominal) for raw in raws)
-    empty = [np.zeros((len(raw.nominal), 0), raw.nominal.dtype) for raw in raws]
-    commands = [
-        none if raw.commands is None else raw.commands
-        for raw, none in zip(raws, empty, strict=True)
-    ]
-    _check_finite(raws, commands)
-    width = commands[0].shape[1] + 2 * first.nominal.shape[1]
+    width = sum(block.shape[1] for block in first.blocks.values())
     budget.take(len(raws) * steps * width * (first.nominal.itemsize + 1))
     lengths = np.array([len(raw.nominal) for raw in raws])
-    observed = _pad([raw.observed for raw in raws], steps)
+    arrays: Any = {name: _pad([raw.blocks[name] for raw in raws], steps) for name in first.blocks}
     present = np.arange(steps)[None, :, None] < lengths[:, None, None]
     return Trajectories(
-        commands=_pad(commands, steps),
-        nominal=_pad([raw.nominal for raw in raws], steps),
-        observed=observed,
+        **arrays,
         rate=_common_rate(raws, case, rate),
-        mask=np.isfinite(observed) & present,
+        mask=np.isfinite(arrays["observed"]) & present,
         labels=np.array([raw.label for raw in raws], dtype=np.str_),
         ids=np.array([raw.id for raw in raws], np.str_) if first.id is not None else None,  # type: ignore[arg-type]
         inputs=inputs,  # type: ignore[arg-type]
@@ -186,10 +175,7 @@ def assemble(
 
 
 def settle(
-    trajectories: Trajectories,
-    case: DataCase | None,
-    rate: float | None,
-    progress: Progress | None,
+    trajectories: Trajectories, case: DataCase | None, rate: float | None, progress: Progress | None
 ) -> Trajectories:
     """`trajectories` with the channels of `case`, labels checked, commands completed.
 
@@ -263,36 +249,30 @@ def _pad(blocks: Sequence[NDArray], steps: int) -> NDArray:
     return padded
 
 
-def _same_width(name: str, raw: Raw, first: Raw) -> None:
-    array, wanted = getattr(raw, name), getattr(first, name)
-    if array is not None:
-        require(
-            array.shape[1] == wanted.shape[1],
+def _check_block(name: str, block: NDArray, raw: Raw, first: Raw) -> None:
+    """Raise InputError for another width than the first one's, and for values that are not finite.
+
+    Outputs that were not measured may be NaN.
+    """
+    width = first.blocks[name].shape[1]
+    require(
+        block.shape[1] == width,
+        raw.where,
+        expected=f"{width} columns of {name}, as in {first.where}",
+        got=block.shape[1],
+        remedy="keep data of different systems apart",
+    )
+    measured = name == "observed"
+    bad = np.isinf(block) if measured else ~np.isfinite(block)
+    if bad.any():
+        sample, column = np.argwhere(bad)[0]
+        repair = "replace infinite measurements by NaN"
+        raise InputError(
             raw.where,
-            expected=f"{wanted.shape[1]} columns of {name}, as in {first.where}",
-            got=array.shape[1],
-            remedy="keep data of different systems apart",
+            expected=f"finite values of {name}",
+            got=f"{block[sample, column]} in sample {sample}, column {column}",
+            remedy=repair if measured else "repair or drop that trajectory",
         )
-
-
-def _check_finite(raws: Sequence[Raw], commands: Sequence[NDArray]) -> None:
-    """Raise InputError, which names the sample, for inputs and outputs that are not finite."""
-    for raw, given in zip(raws, commands, strict=True):
-        for name, block, bad in (
-            ("nominal", raw.nominal, ~np.isfinite(raw.nominal)),
-            ("commands", given, ~np.isfinite(given)),
-            ("observed", raw.observed, np.isinf(raw.observed)),
-        ):
-            if bad.any():
-                sample, column = np.argwhere(bad)[0]
-                raise InputError(
-                    raw.where,
-                    expected=f"finite values of {name}",
-                    got=f"{block[sample, column]} in sample {sample}, column {column}",
-                    remedy="replace infinite measurements by NaN"
-                    if name == "observed"
-                    else "repair or drop that trajectory",
-                )
 
 
 def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None) -> float:

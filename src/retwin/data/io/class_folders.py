@@ -78,14 +78,8 @@ def read_class_folders(
             )
             raws.append(read(file, where, case, budget, reader))
     raws, inputs = _commands_of_case(raws, case, radians=read is _read_dataset)
-    return assemble(
-        raws,
-        source=Provenance(path.resolve().name, sha256(path)),
-        case=case,
-        rate=rate,
-        budget=budget,
-        inputs=inputs,
-    )
+    source = Provenance(path.resolve().name, sha256(path))
+    return assemble(raws, source=source, case=case, rate=rate, budget=budget, inputs=inputs)
 
 
 def _in_order(path: Path, pattern: str) -> list[Path]:

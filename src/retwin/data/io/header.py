@@ -48,7 +48,7 @@ def header_of(trajectories: Trajectories, arrays: Mapping[str, NDArray]) -> dict
         "arrays": {
             name: {"shape": list(arrays[name].shape), "sha256": _digest(arrays[name])}
             for name in NAMES
-        },
+        }
     }
 
 

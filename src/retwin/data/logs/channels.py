@@ -53,16 +53,8 @@ class Channel:
 
     def resample(self, grid: NDArray, period: float, end: float) -> NDArray:
         """Its values (N,) on a grid of times, NaN where they are missing."""
-        last = end if self.how == "hold" else None
-        return resample(
-            self.signal.times,
-            self.signal.values,
-            grid,
-            period,
-            self.how,
-            longest=self.longest,
-            end=last,
-        )
+        known, last = (self.signal.times, self.signal.values), end if self.how == "hold" else None
+        return resample(*known, grid, period, self.how, longest=self.longest, end=last)
 
     def sampling(self, rate: float, missing: float, *, decimated: float = 1.5) -> Sampling:
         """What its provenance says, with the share of its samples that are missing.
@@ -79,24 +71,16 @@ class Channel:
         notes = list(self.notes)
         if self.how != "hold" and own > decimated * rate:
             notes.append("samples left out, not filtered")
-        return Sampling(
-            self.name,
-            self.signal.name,
-            self.how,
-            own,
-            missing,
+        bridged, longest = (
             self.longest if self.how != "none" else 0.0,
             float(steps.max(initial=0.0)),
-            "; ".join(notes),
         )
+        about = (own, missing, bridged, longest, "; ".join(notes))
+        return Sampling(self.name, self.signal.name, self.how, *about)
 
 
 def table_of(
-    table: Mapping[str, ChannelMapping],
-    wanted: Channels | None,
-    name: str,
-    *,
-    stated: bool = True,
+    table: Mapping[str, ChannelMapping], wanted: Channels | None, name: str, *, stated: bool = True
 ) -> list[tuple[str, ChannelMapping, str | None]]:
     """The channels of a table of the mapping in their order, with the unit that the case has.
 
@@ -136,12 +120,7 @@ def channels_of(
 
 
 def _channel(
-    log: Log,
-    name: str,
-    own: ChannelMapping,
-    unit: str | None,
-    default: Resampling,
-    period: float,
+    log: Log, name: str, own: ChannelMapping, unit: str | None, default: Resampling, period: float
 ) -> Channel:
     found = [signal_of(log, each) for each in own.signals]
     signal, notes = in_order(mean_of(found, log.name), log.name)

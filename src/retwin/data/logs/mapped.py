@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -41,11 +41,7 @@ def read_mapped(
     settings = mapping if isinstance(mapping, Mapping) else read_mapping(mapping)
     budget = Budget(path.name, max_bytes)
     log = read_log(
-        path,
-        wanted=settings.signals,
-        clock=settings.time.clock,
-        budget=budget,
-        progress=progress,
+        path, wanted=settings.signals, clock=settings.time.clock, budget=budget, progress=progress
     )
     return mapped(log, settings, case=case, rate=rate, budget=budget)
 
@@ -84,7 +80,29 @@ def mapped(
 
     """
     found = parts_of(log, mapping, budget=budget, case=case, rate=rate)
-    return _finish(log, found.raws(log, mapping.label), found, case, budget)
+    raws = found.raws(log, mapping.label)
+    inputs, outputs = (
+        Channels(tuple(each.name for each in some), tuple(each.unit for each in some))
+        for some in (found.commands, found.measured)
+    )
+    source, given = Provenance(log.name, log.sha256), inputs if len(inputs) else None
+    made = assemble(raws, source=source, case=None, rate=found.rate, budget=budget, inputs=given)
+    notes = found.notes(log)
+    twin = getattr(case, "twin", None)
+    nominal = made.nominal
+    if found.ideal:
+        notes.append("nominal outputs from the log")
+    elif twin is not None and found.commands:
+        nominal = twin.simulate(made.commands, seed=0).nominal
+        notes.append("nominal outputs simulated by the twin of the case")
+    else:
+        notes.append(NO_NOMINAL)
+    sampling = tuple(
+        each.sampling(found.rate, missing)
+        for each, missing in zip(found.every, found.missing(), strict=True)
+    )
+    source = replace(source, sampling=sampling, notes=tuple(notes))
+    return made.replace(nominal=nominal, outputs=outputs, provenance=(source,))
 
 
 def parts_of(
@@ -105,12 +123,8 @@ def parts_of(
     commands = channels_of(log, taken, "hold", period)
     taken = table_of(mapping.outputs, outputs, "outputs", stated=stated)
     measured = channels_of(log, taken, "linear", period)
-    ideal = channels_of(
-        log,
-        table_of(mapping.nominal, outputs, "nominal") if mapping.nominal else [],
-        "linear",
-        period,
-    )
+    taken = table_of(mapping.nominal, outputs, "nominal") if mapping.nominal else []
+    ideal = channels_of(log, taken, "linear", period)
     found = Parts(log.end, rate, commands, measured, ideal)
     trigger = None
     if mapping.cut.by == "trigger" and mapping.cut.signal:
@@ -255,44 +269,6 @@ class Parts:
             for note in each.notes:
                 channels.setdefault(note, []).append(each.name)
         return [f"{', '.join(own)}: {note}" for note, own in channels.items()]
-
-
-def _finish(
-    log: Log,
-    raws: Sequence[Raw],
-    found: Parts,
-    case: DataCase | None,
-    budget: Budget,
-) -> Trajectories:
-    """The trajectories of the parts, with nominal outputs and provenance."""
-    inputs, outputs = (
-        Channels(tuple(each.name for each in some), tuple(each.unit for each in some))
-        for some in (found.commands, found.measured)
-    )
-    made = assemble(
-        raws,
-        source=Provenance(log.name, log.sha256),
-        case=None,
-        rate=found.rate,
-        budget=budget,
-        inputs=inputs if len(inputs) else None,
-    )
-    notes = found.notes(log)
-    twin = getattr(case, "twin", None)
-    nominal = made.nominal
-    if found.ideal:
-        notes.append("nominal outputs from the log")
-    elif twin is not None and found.commands:
-        nominal = twin.simulate(made.commands, seed=0).nominal
-        notes.append("nominal outputs simulated by the twin of the case")
-    else:
-        notes.append(NO_NOMINAL)
-    sampling = tuple(
-        each.sampling(found.rate, missing)
-        for each, missing in zip(found.every, found.missing(), strict=True)
-    )
-    source = Provenance(log.name, log.sha256, sampling, tuple(notes))
-    return made.replace(nominal=nominal, outputs=outputs, provenance=(source,))
 
 
 def _rate(mapping: Mapping, case: DataCase | None, rate: float | None) -> float:

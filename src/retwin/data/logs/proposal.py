@@ -25,17 +25,6 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-__all__ = [
-    "Fact",
-    "Proposal",
-    "channel_mapping",
-    "cut_at_pauses",
-    "facts_of",
-    "propose_mapping",
-    "proposed",
-    "shortest_pause",
-]
-
 COMMAND = re.compile(
     r"(^|[^a-z])(cmd|command(s|ed)?|set_?point(s)?|target(s)?|ref(erence)?|desired|demand|goal|"
     r"input(s)?|control|u|soll(wert)?|sp)([^a-z]|\d|$)"
@@ -170,15 +159,12 @@ def _read_stamped(
         return None
     begin = (proposal.log.begin - other.begin) * NANOSECOND
     unstamped = [topic for topic, why in other.skipped.items() if why == NO_STAMP]
-    delays = np.concatenate(
-        [
-            one.times - two.times + begin
-            for one, two in pairs
-            if not any(one.name.startswith(topic) for topic in unstamped)
-        ]
-        or [np.array([-1.0])]
-    )
-    found = float(np.median(delays))
+    delays = [
+        one.times - two.times + begin
+        for one, two in pairs
+        if not any(one.name.startswith(topic) for topic in unstamped)
+    ]
+    found = float(np.median(np.concatenate(delays))) if delays else -1.0
     return (other, found) if 0 <= found < max_stamp_age else None
 
 
@@ -193,16 +179,9 @@ def _fact(signal: Signal) -> Fact:
     steps = np.diff(at)
     typical = float(np.median(steps)) if len(steps) else 0.0
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
-    return Fact(
-        signal.name,
-        signal.unit or unit_in_name(signal.name),
-        len(values),
-        1 / typical if typical > 0 else 0.0,
-        float(steps.max(initial=0.0)),
-        low,
-        high,
-        not low < high,
-    )
+    unit, rate = signal.unit or unit_in_name(signal.name), 1 / typical if typical > 0 else 0.0
+    longest = float(steps.max(initial=0.0))
+    return Fact(signal.name, unit, len(values), rate, longest, low, high, not low < high)
 
 
 def proposed(

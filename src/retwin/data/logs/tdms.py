@@ -92,13 +92,11 @@ def _waveform_times(channel: Any, count: int) -> NDArray | None:
 def _group_times(path: Path, channel: Any, group: str, count: int, clock: Clock) -> NDArray:
     """Times in ns of a group without waveform properties."""
     if channel is not None and len(channel) == count:
-        cells = np.asarray(channel[:])
-        return row_times(
-            cells,
+        unit, where = (
             _unit(channel) or unit_in(channel.name),
-            clock,
             f"{path.name}, {group}/{channel.name}",
         )
+        return row_times(np.asarray(channel[:]), unit, clock, where)
     if clock.rate:
         return even_times(count, clock.rate, path.name)
     raise InputError(

@@ -48,7 +48,7 @@ def explained_shares(records: Trajectories) -> dict[str, dict[str, float]]:
     for kind, rows in (("healthy", records.maybe_healthy), ("faulty", ~records.maybe_healthy)):
         if not rows.any():
             continue
-        y = np.where(records.mask, records.observed, np.nan)[rows].astype(float)
+        y = records.measured[rows].astype(float)
         residual = np.nansum((y - records.nominal[rows]) ** 2, axis=(0, 1))
         count = np.maximum(np.isfinite(y).sum(axis=(0, 1)), 1)
         power = np.nansum((y - np.nansum(y, axis=(0, 1)) / count) ** 2, axis=(0, 1))
@@ -63,7 +63,7 @@ def find_disagreements(records: Trajectories) -> Iterator[Finding]:
     varies &= records.mask.any(axis=(0, 1))
     if not varies.any():
         return
-    y = np.where(records.mask, records.observed, np.nan)[..., varies].astype(float)
+    y = records.measured[..., varies].astype(float)
     ideal = np.where(np.isfinite(y), records.nominal[..., varies], np.nan).astype(float)
     names = [name for name, own in zip(records.outputs.names, varies, strict=True) if own]
     seen = np.isfinite(y).any(axis=(1, 2))

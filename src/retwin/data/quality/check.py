@@ -97,7 +97,7 @@ def check_records(records: Trajectories) -> Checked:
             found += [*find_stretches(healthy), *find_noise(healthy)]
     found += [
         Finding(ids[i], "", "copy", f"a copy of {ids[j]}" + f", {why}" * bool(why))
-        for i, j, why in find_copies(np.where(records.mask, records.observed, np.nan))
+        for i, j, why in find_copies(records.measured)
     ]
     found += [*scales, *find_disagreements(rest)]
     # A record of which more is known needs no more general finding.

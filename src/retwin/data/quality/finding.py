@@ -51,13 +51,19 @@ class Finding:
         return self.record or "all", self.channel, self.time, text
 
 
-def summarise(findings: Iterable[Finding]) -> list[str]:
-    """A sentence for each kind of finding in each channel, with the records that have it."""
+def group_alike(findings: Iterable[Finding]) -> list[list[Finding]]:
+    """The findings of each kind in each channel, in the order of their first."""
     groups: dict[tuple[str, str], list[Finding]] = {}
     for each in findings:
         groups.setdefault((each.kind, each.channel), []).append(each)
+    return list(groups.values())
+
+
+def summarise(findings: Iterable[Finding]) -> list[str]:
+    """A sentence for each kind of finding in each channel, with the records that have it."""
     made = []
-    for (kind, channel), own in groups.items():
+    for own in group_alike(findings):
+        kind, channel = own[0].kind, own[0].channel
         records = list(dict.fromkeys(each.record for each in own if each.record))
         more = f" and {len(records) - NAMED} more" if len(records) > NAMED else ""
         where = f" in {', '.join(records[:NAMED])}{more}" if records else ""

@@ -19,7 +19,7 @@ def find_scales(records: Trajectories) -> Iterator[Finding]:
     commands = np.where(
         (np.arange(records.steps) < records.lengths[:, None])[..., None], records.commands, np.nan
     )
-    measured = np.where(records.mask, records.observed, np.nan)
+    measured = records.measured
     for channels, values in ((records.inputs, commands), (records.outputs, measured)):
         for k, name in enumerate(channels.names):
             known = [own[np.isfinite(own)] for own in values[..., k].astype(float)]

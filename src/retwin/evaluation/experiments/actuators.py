@@ -116,12 +116,9 @@ class ActuatorKnowledge:
         low, high = self.operator.delay_range or (0.0, 0.0)
         mask = torch.ones(context.nominal.shape, dtype=torch.bool)
         correction = self.twin.residual.correction
+        mask = sample_mask(correction, context.nominal, mask, context.rate)
+        limits, count = (low * context.rate, high * context.rate), self.operator.max_samples
         problem = CommandProblem.of(
-            context,
-            context.nominal,
-            sample_mask(correction, context.nominal, mask, context.rate),
-            delay_range=(low * context.rate, high * context.rate),
-            max_samples=self.operator.max_samples,
-            unit=self.unit,
+            context, context.nominal, mask, delay_range=limits, max_samples=count, unit=self.unit
         )
         return replace(problem, own_delays=True)

@@ -10,8 +10,8 @@ turn, which gives the distribution under a perfect generator.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -20,12 +20,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Channels
 from retwin.evaluation.fidelity.stored import StoredArrays
-from retwin.scores.distributions import (
-    central_band,
-    cumulative_counts,
-    ks_distance,
-    share_as_far,
-)
+from retwin.scores.distributions import central_band, cumulative_counts, ks_distance, share_as_far
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 
 BINS = 100
@@ -122,24 +117,6 @@ class Fidelity(StoredArrays):
     def __str__(self) -> str:
         figures = ", ".join(f"{name} {each.value:.4g}" for name, each in self.figures.items())
         return f"{figures} ({len(self)} trajectories)"
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[Fidelity]) -> Fidelity:
-        """Several sets of trajectories as one, each compared with a twin of its own."""
-        segments = max(part.segment_values.shape[2] for part in parts)
-        padded = [
-            replace(part, segment_values=_pad(part.segment_values, segments)) for part in parts
-        ]
-        arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in padded])
-            for name, value in vars(padded[0]).items()
-            if isinstance(value, np.ndarray)
-        }
-        rivals: dict[str, Any] = {
-            name: tuple(map(np.concatenate, zip(*(p.rivals[name] for p in parts), strict=True)))
-            for name in parts[0].rivals
-        }
-        return replace(parts[0], rivals=rivals, **arrays)
 
     def inside(self, level: int, *, widened: bool = False) -> NDArray:
         """Share (n, d) of each trajectory's samples inside its central 50 or 90 % band."""
@@ -316,8 +293,3 @@ def _share(hits: NDArray, counts: NDArray | None = None) -> Figure:
     """Successes over trials of all trajectories (n,), by default of one trial each."""
     trials = np.ones(len(hits)) if counts is None else counts
     return Figure(float(hits.sum() / trials.sum()), grouped_share_interval(hits, trials))
-
-
-def _pad(values: NDArray, segments: int) -> NDArray:
-    missing = segments - values.shape[2]
-    return np.pad(values, ((0, 0), (0, 0), (0, missing), (0, 0)), constant_values=np.nan)

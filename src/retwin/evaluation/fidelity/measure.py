@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import require, whole
 from retwin.data.segments import Segments
-from retwin.data.trajectories import Channels, Trajectories
+from retwin.data.trajectories import PER_SAMPLE, Channels, Trajectories
 from retwin.evaluation.fidelity.figures import BINS, Fidelity
 from retwin.evaluation.fidelity.latents import shown_latents
 from retwin.progress import Progress, tracked
@@ -112,10 +112,6 @@ def measure_fidelity(
         name: tuple(map(np.array, zip(*(row[f"rival/{name}"] for row in rows), strict=True)))
         for name in against
     }
-    names = (
-        *("nominal", "observed", "seen", "bands", "crps", "energy", "pit", "features"),
-        "segment_values",
-    )
     return Fidelity(
         outputs=trajectories.outputs,
         segment_channels=_segment_channels(twin, trajectories.rate),
@@ -125,7 +121,7 @@ def measure_fidelity(
         rivals=rivals,
         widening=np.full(len(trajectories), np.nan if widening is None else widening),
         at_bound=np.full(len(trajectories), _at_bound(twin)),
-        **{name: np.stack([row[name] for row in rows]) for name in names},
+        **{name: np.stack([row[name] for row in rows]) for name in rows[0] if "rival/" not in name},
     )
 
 
@@ -216,16 +212,11 @@ class _Ensemble:
     ) -> _Ensemble:
         """With `draws` simulations by the twin."""
         made = twin.simulate(np.repeat(one.commands, draws, axis=0), seed=seed)
-        members = Trajectories(
-            commands=np.repeat(one.commands, draws + 1, axis=0),
-            nominal=np.repeat(one.nominal, draws + 1, axis=0),
-            observed=np.concatenate([one.observed, made.observed.astype(one.observed.dtype)]),
-            mask=np.repeat(one.mask, draws + 1, axis=0),
-            rate=one.rate,
-            inputs=one.inputs,
-            outputs=one.outputs,
-        )
-        return cls(one, members, stride)
+        repeated = (np.repeat(getattr(one, name), draws + 1, axis=0) for name in PER_SAMPLE)
+        arrays: Any = dict(zip(PER_SAMPLE, repeated, strict=True))
+        arrays["observed"][1:] = made.observed
+        about: Any = {"rate": one.rate, "inputs": one.inputs, "outputs": one.outputs}
+        return cls(one, Trajectories(**arrays, **about), stride)
 
     @property
     def seen(self) -> NDArray:
@@ -281,15 +272,10 @@ def _features(residual: NDArray) -> NDArray:
     edges = np.arange(WINDOWS + 1) * residual.shape[1] // WINDOWS
     # Every window has a sample, however short a trajectory is.
     windows = [slice(a, max(a + 1, b)) for a, b in pairwise(edges)]
-    values = [
-        value
-        for window in windows
-        for value in (
-            residual[:, window].mean(axis=1),
-            residual[:, window].std(axis=1),
-            steps[:, window].mean(axis=1),
-        )
-    ]
+    values = []
+    for window in windows:
+        part = residual[:, window]
+        values += [part.mean(axis=1), part.std(axis=1), steps[:, window].mean(axis=1)]
     return np.concatenate(values, axis=1).astype(np.float32)
 
 

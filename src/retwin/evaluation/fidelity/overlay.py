@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,25 +45,6 @@ class Overlay(StoredArrays):
     z: NDArray
     deviation: NDArray
     times: NDArray
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[Overlay]) -> Overlay:
-        """Overlays of several sets as one; missing segments are filled with NaN."""
-        segments = max(part.times.shape[1] for part in parts)
-
-        def padded(values: NDArray) -> NDArray:
-            missing = segments - values.shape[1]
-            return np.pad(values, ((0, 0), (0, missing), (0, 0)), constant_values=np.nan)
-
-        return cls(
-            parts[0].latent,
-            np.concatenate([part.ids for part in parts]),
-            np.concatenate([part.bands for part in parts]),
-            *(
-                np.concatenate([padded(getattr(part, name)) for part in parts])
-                for name in ("z", "deviation", "times")
-            ),
-        )
 
 
 @checked_once

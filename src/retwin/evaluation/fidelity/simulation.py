@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,10 +71,10 @@ class Simulation(StoredArrays):
     @classmethod
     def joined(cls, parts: Sequence[Simulation], ids: NDArray) -> Simulation:
         """Simulations of several folds as one, in the order of `ids`."""
-        names = np.concatenate([part.ids for part in parts]).tolist()
+        every = cls.concatenate(parts)
+        names = every.ids.tolist()
         order = [names.index(name) for name in ids.tolist()]
-        arrays = ([getattr(part, each.name) for part in parts] for each in fields(cls))
-        return cls(*(np.concatenate(each)[order] for each in arrays))
+        return cls(*(each[order] for each in vars(every).values()))
 
 
 @checked_once
@@ -111,7 +111,7 @@ def simulate_records(
     """
     once = getattr(twin, "deterministic", False)
     seeds = np.random.SeedSequence(seed).generate_state(len(records)).tolist()
-    measured = np.where(records.mask, records.observed, np.nan).astype(np.float64)
+    measured = records.measured.astype(np.float64)
     means, bands, scores, densities = [], [], [], []
     for i, twin_seed in tracked(enumerate(seeds), len(seeds), progress):
         commands = np.repeat(records.commands[[i]], 1 if once else draws, axis=0)
@@ -152,7 +152,7 @@ def simulation_scores(means: NDArray, records: Trajectories) -> dict[str, NDArra
         per sample.
 
     """
-    observed = np.where(records.mask, records.observed, np.nan)
+    observed = records.measured
     deviation = np.nanstd(observed.astype(float), axis=(0, 1))
     comparable = 1.0 if records.outputs.comparable else np.nan
     square, score, half, wide, density = np.moveaxis(means, -1, 0)

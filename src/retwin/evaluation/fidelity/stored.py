@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self, get_origin, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 from retwin.data.trajectories import Channels
 from retwin.serialisation.files import write_atomically
@@ -30,6 +31,22 @@ class StoredArrays:
             np.savez_compressed(part, allow_pickle=False, **arrays)
 
     @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """The rows of several results as one; where some have fewer segments, NaN follows."""
+        joined: dict[str, Any] = {}
+        for name in get_type_hints(cls):
+            values = [getattr(part, name) for part in parts]
+            first = joined[name] = values[0]
+            if isinstance(first, np.ndarray):
+                joined[name] = _concatenate(values)
+            elif isinstance(first, Mapping):
+                joined[name] = {
+                    key: tuple(map(_concatenate, zip(*(each[key] for each in values), strict=True)))
+                    for key in first
+                }
+        return cls(**joined)
+
+    @classmethod
     def load(cls, file: str | Path) -> Self:
         """Read what `save` wrote."""
         values: dict[str, Any] = {}
@@ -48,3 +65,13 @@ class StoredArrays:
                 else:
                     values[name] = kind(found[name]) if kind in (int, float) else found[name]
         return cls(**values)
+
+
+def _concatenate(arrays: Sequence[NDArray]) -> NDArray:
+    """Arrays along their first axis, filled with NaN up to the largest of the others."""
+    shape = np.max([each.shape[1:] for each in arrays], axis=0).astype(int)
+    padded = []
+    for each in arrays:
+        missing = [(0, 0), *((0, n) for n in shape - each.shape[1:])]
+        padded.append(np.pad(each, missing, constant_values=np.nan) if np.any(missing) else each)
+    return np.concatenate(padded)

@@ -191,15 +191,14 @@ def _of_posterior(
     directions = _directions(before.names, vectors.T, along, open_from * UNIFORM)
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.atleast_2d(np.corrcoef(scaled.T))
-    made = estimates(
-        before,
+    intervals = np.quantile(found.samples, [0.025, 0.975], axis=0).T
+    about = (
         found.samples.mean(axis=0),
         deviation * width,
-        np.quantile(found.samples, [0.025, 0.975], axis=0).T,
+        intervals,
         deviation < open_from * UNIFORM,
-        sides,
-        bounded=True,
     )
+    made = estimates(before, *about, sides, bounded=True)
     return Uncertainty(made, correlation, directions, "posterior")
 
 
@@ -227,19 +226,11 @@ def estimates(
     for i, each in enumerate(before.parameters):
         lost = (bool(sides[i]) and not bounded) or np.isnan(errors[i])
         known = not lost and np.isfinite(intervals[i]).all()
-        estimate = ParameterEstimate(
-            each.name,
-            each.unit,
-            each.low,
-            each.high,
-            before.values[i],
-            float(values[i]),
-            float("nan") if lost else float(errors[i]),
-            (float(intervals[i][0]), float(intervals[i][1])) if known else None,
-            False,
-            sides[i],  # type: ignore[arg-type]
-            bool(len(depends) and depends[i]),
-        )
+        about = each.name, each.unit, each.low, each.high, before.values[i], float(values[i])
+        error = float("nan") if lost else float(errors[i])
+        interval = (float(intervals[i][0]), float(intervals[i][1])) if known else None
+        side, depending = sides[i], bool(len(depends) and depends[i])
+        estimate = ParameterEstimate(*about, error, interval, False, side, depending)  # type: ignore[arg-type]
         narrow = estimate.covered is not None and estimate.covered <= WIDEST
         inside = narrow and not estimate.leaves and not sides[i]
         made.append(replace(estimate, identified=bool(agreed[i]) and inside))

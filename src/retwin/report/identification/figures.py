@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.evaluation.identification import Identification
+from retwin.evaluation.identification.validation import Identification
 from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row, record_panel
 from retwin.report.labels import behind
 from retwin.report.residual_panels import ChannelRecords, Errors, residual_figures
@@ -31,11 +31,7 @@ def figures(found: Identification) -> dict[str, Figure]:
         for each in (before, after)
     ]
     shown = [i for i in range(len(measured.outputs)) if measured.mask[..., i].any()][:OUTPUTS]
-    made = [
-        _estimates(found),
-        _records(found, shown),
-        *_residuals(measured, errors, shown),
-    ]
+    made = [_estimates(found), _records(found, shown), *_residuals(measured, errors, shown)]
     return {each.name: each for each in made if each.panels}
 
 

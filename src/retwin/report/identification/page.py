@@ -7,7 +7,7 @@ from math import isfinite
 from typing import Any
 
 from retwin.data.quality.check import Checked
-from retwin.evaluation.identification import Identification
+from retwin.evaluation.identification.validation import Identification
 from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Cell, Table, grouped, tabulate, text_column
 from retwin.report.identification.figures import INPUTS, OUTPUTS, figures

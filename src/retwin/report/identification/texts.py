@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from math import isfinite, isnan
 
 from retwin.cases.matching import CONSTANT
-from retwin.evaluation.identification import Direction, Identification, ParameterEstimate, RMSError
-from retwin.evaluation.identification.parameters import WIDEST
-from retwin.evaluation.identification.validation import BEGIN
+from retwin.evaluation.identification.parameters import WIDEST, Direction, ParameterEstimate
+from retwin.evaluation.identification.validation import BEGIN, Identification, RMSError
 from retwin.report.assets import sentences
 from retwin.report.labels import behind, signed, significant
 from retwin.update.dynamics.windows import state_based

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from retwin.report.blocks import Section
 from retwin.report.figure import Matrices, Matrix
 from retwin.report.labels import class_name, source_name
@@ -14,15 +16,10 @@ def confusion(study: Study) -> Section | None:
     classes = study.results.classes
     shown = [
         Matrix(
-            source_name(name),
-            name,
-            source.confusion,
-            row_shares(source.confusion),
-            correct=sum(row[k] for k, row in enumerate(source.confusion)),
-            total=sum(map(sum, source.confusion)),
+            source_name(name), name, counts, row_shares(counts), np.trace(counts), np.sum(counts)
         )
         for name, source in study.sources.items()
-        if source.confusion and classes
+        if (counts := source.confusion) and classes
     ]
     if not shown:
         return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from retwin.report.blocks import Cell, Section, Table, tabulate
@@ -17,24 +16,14 @@ from retwin.report.labels import (
     with_unit,
 )
 from retwin.report.sections.segment import segment, segment_figure
-from retwin.report.study import Study
+from retwin.report.study import Component, Study
 from retwin.report.style import colour_of
 from retwin.results import FidelityFigure
-from retwin.scores.histograms import Histogram, common_histogram
 
 FEW = 3
 """The number of sources up to which all are shown in detail."""
 KINDS = {"tde": "delay", "tpe": "offset_", "noise": "noise_"}
 """The figures by name, and the first letters of the components of z that they show."""
-
-
-@dataclass(frozen=True)
-class Latent:
-    """A component of z: its name, its unit, and its observed and generated values in bins."""
-
-    name: str
-    unit: str
-    values: Histogram
 
 
 def discrepancy(study: Study) -> Section | None:
@@ -82,13 +71,9 @@ def figure_cell(figure: FidelityFigure | None, digits: int = 3, factor: float = 
     return Cell(number(factor * figure.value, digits), below)
 
 
-def latents(study: Study, source: str) -> list[Latent]:
+def latents(study: Study, source: str) -> list[Component]:
     """Every component of z of which there are observed and generated values."""
-    return [
-        Latent(each.name, each.unit, histogram)
-        for each in study.components(source)
-        if (histogram := common_histogram(each.observed, each.predicted)) is not None
-    ]
+    return [each for each in study.components(source) if each.values is not None]
 
 
 def _groups(study: Study, source: str) -> list[dict[str, Any]]:
@@ -104,29 +89,27 @@ def _groups(study: Study, source: str) -> list[dict[str, Any]]:
     return groups
 
 
-def _figure(source: str, name: str, shown: list[Latent]) -> Figure:
+def _figure(source: str, name: str, shown: list[Component]) -> Figure:
     """Observed as bars, generated as a stepped line, a panel per component."""
     keys = [Key("observed", "observed", "bar"), Key("generated", colour_of(source))]
     panels = [_panel(each, colour_of(source)) for each in shown]
     return Figure(name, panels, keys, source, narrow=len(panels) == 1)
 
 
-def _panel(latent: Latent, colour: str) -> Panel:
+def _panel(latent: Component, colour: str) -> Panel:
     title, label = latent_names(latent.name)
     values = latent.values
+    assert values is not None
     low, high = float(values.edges[0]), float(values.edges[-1])
     marks = [
         bar(values.edges, values.observed, "observed", "observed"),
         Line(*outline(values.edges, values.generated), "generated", colour, width=2.2),
     ]
     limits = f"{number(low, 1)} to {number(high, 1)}"
-    return Panel(
-        Axis(label, latent.unit, (low, high), count=7),
-        [Row(Axis("share per bin", kind="percent", from_zero=True), marks)],
-        with_unit(f"{title}, observed and generated, {limits}", latent.unit),
-        title,
-        height=300,
-    )
+    x = Axis(label, latent.unit, (low, high), count=7)
+    y = Axis("share per bin", kind="percent", from_zero=True)
+    alt = with_unit(f"{title}, observed and generated, {limits}", latent.unit)
+    return Panel(x, [Row(y, marks)], alt, title, height=300)
 
 
 def _agreement(study: Study, source: str) -> Table | None:

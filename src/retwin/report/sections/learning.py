@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from retwin.catalog import METRICS
 from retwin.report.blocks import Section
@@ -44,13 +45,9 @@ def _panel(study: Study, metric: str, curves: Curves) -> Panel:
     else:
         y = Axis(title, limits=(-0.02, 1.02), kind="share", step=0.2)
     marks = [_points(metric, name, points, factor) for name, points in curves.items()]
-    return Panel(
-        Axis("healthy trajectories", kind="log", ticks={count: str(count) for count in counts}),
-        [Row(y, marks)],
-        f"{title} against calibration trajectories",
-        title,
-        height=320,
-    )
+    x = Axis("healthy trajectories", kind="log", ticks={count: str(count) for count in counts})
+    alt = f"{title} against calibration trajectories"
+    return Panel(x, [Row(y, marks)], alt, title, height=320)
 
 
 def _points(metric: str, source: str, points: list[CurvePoint], factor: float) -> Points:
@@ -62,16 +59,8 @@ def _points(metric: str, source: str, points: list[CurvePoint], factor: float) -
     ]
     # Sources stand side by side, so that intervals do not cover each other.
     shift = 1.02 ** (colour_index(source) - 3)
-    return Points(
-        [point.healthy * shift for point in points],
-        means,
-        source_name(source),
-        colour_of(source),
-        symbol(source),
-        ends=ends,
-        along="y",
-        texts=[f"{point.healthy}: {m:.3f}" for point, m in zip(points, means, strict=True)],
-        dash=dash(source),
-        size=7,
-        bar_width=1.4,
-    )
+    x = [point.healthy * shift for point in points]
+    texts = [f"{point.healthy}: {m:.3f}" for point, m in zip(points, means, strict=True)]
+    look: Any = {"symbol": symbol(source), "dash": dash(source), "size": 7, "bar_width": 1.4}
+    name, colour = source_name(source), colour_of(source)
+    return Points(x, means, name, colour, ends=ends, along="y", texts=texts, **look)

@@ -38,28 +38,18 @@ def paper(study: Study) -> Section | None:
         *grouped("this study", *map(source_name, known)),
         text_column("on this page"),
     ]
-    rows = [
-        *(
-            _row(
-                f"Table 1: {in_sentence(metric_name(metric))}",
-                _published(study, known, metric),
-                _means(study, known, metric),
-                Link("Scores", "scores"),
-            )
-            for metric in TABLE1
-        ),
-        *(
-            _row(what, ["–"] * len(known), _means(study, known, metric), link)
-            for what, metric, link in FIGURES
-        ),
-        *_distributions(study, known),
-        _row(
-            f"Section 5: {PUBLISHED_BULK} trajectories in",
-            _published(study, known, "generate"),
-            [duration(study.sources[name].generation_seconds(PUBLISHED_BULK)) for name in known],
-            Link("Time", "time"),
-        ),
-    ]
+    rows = []
+    for metric in TABLE1:
+        published, here = _published(study, known, metric), _means(study, known, metric)
+        what = f"Table 1: {in_sentence(metric_name(metric))}"
+        rows.append(_row(what, published, here, Link("Scores", "scores")))
+    for what, metric, link in FIGURES:
+        rows.append(_row(what, ["–"] * len(known), _means(study, known, metric), link))
+    rows += _distributions(study, known)
+    seconds = [study.sources[name].generation_seconds(PUBLISHED_BULK) for name in known]
+    published, here = _published(study, known, "generate"), list(map(duration, seconds))
+    what = f"Section 5: {PUBLISHED_BULK} trajectories in"
+    rows.append(_row(what, published, here, Link("Time", "time")))
     table = tabulate("Table 1, figures 3 to 6 and times", heads, rows)
     return Section("paper", "The paper and this study", {"table": table})
 

@@ -38,19 +38,12 @@ def _panel(study: Study, source: str) -> Panel:
     found = calibration.reliability(study.probabilities(source), study.truth)
     title, colour = source_name(source), colour_of(source)
     breaks = np.full(len(found.confidence), np.nan)
-    bars = np.stack([found.low, found.high, breaks], axis=1).ravel()
+    x, y = np.repeat(found.confidence, 3), np.stack([found.low, found.high, breaks], axis=1).ravel()
+    perfect: Any = {"width": 7, "alpha": 0.35, "hover": False}
     share: dict[str, Any] = {"limits": (-0.03, 1.05), "kind": "share", "step": 0.2}
     marks: list[Mark] = [
         Line([0, 1], [0, 1], "perfect calibration", "muted", "dot", width=1, hover=False),
-        Line(
-            np.repeat(found.confidence, 3),
-            bars,
-            "perfectly calibrated",
-            colour,
-            width=7,
-            alpha=0.35,
-            hover=False,
-        ),
+        Line(x, y, "perfectly calibrated", colour, **perfect),
         Points(found.confidence, found.accuracy, title, colour, symbol(source)),
     ]
     return Panel(

@@ -11,13 +11,7 @@ from retwin.arrays import runs
 from retwin.report.blocks import Cell, Section, Table, tabulate
 from retwin.report.figure import Axis, Figure, Key, Mark, Panel, Points, Row, Spans
 from retwin.report.labels import decimals, number, p_value, quantity, source_name, with_unit
-from retwin.report.residual_panels import (
-    ChannelRecords,
-    Errors,
-    line,
-    log_axis,
-    residual_figures,
-)
+from retwin.report.residual_panels import ChannelRecords, Errors, line, log_axis, residual_figures
 from retwin.report.study import Study
 from retwin.report.style import colour_of, dash
 from retwin.scores.residuals import (
@@ -196,14 +190,9 @@ def _amplitudes(errors: Errors, of: ChannelRecords) -> Panel | None:
     for key, each in found.items():
         x, y = each.centre, each.rms
         marks.append(Points(x, y, key.text, key.colour, dash=key.mark, size=6))
-    name, unit = errors.output.name, errors.output.unit
-    return Panel(
-        Axis(of.name, of.unit),
-        [Row(log_axis("RMS error", unit, [each.rms for each in found.values()]), marks)],
-        f"Error of {name} by the value of {of.name}",
-        f"{name} by {of.name}",
-        height=320,
-    )
+    name, alt = errors.output.name, f"Error of {errors.output.name} by the value of {of.name}"
+    rows = [Row(log_axis("RMS error", errors.output.unit, [e.rms for e in found.values()]), marks)]
+    return Panel(Axis(of.name, of.unit), rows, alt, f"{name} by {of.name}", height=320)
 
 
 def _over_time(errors: Errors, outside: NDArray, rate: float) -> Panel:
@@ -213,14 +202,9 @@ def _over_time(errors: Errors, outside: NDArray, rate: float) -> Panel:
     marks: list[Mark] = [Spans(list(_runs(outside, edges, rate)))] if outside.any() else []
     for key, (_, rms) in found.items():
         marks.append(line((edges[1:] + edges[:-1]) / 2, rms, key))
+    x, name = Axis("time", "s", (0, edges[-1]), count=8), errors.output.name
     y = log_axis("RMS error", errors.output.unit, [rms for _, rms in found.values()])
-    return Panel(
-        Axis("time", "s", (0, edges[-1]), count=8),
-        [Row(y, marks)],
-        f"Error of {errors.output.name} over time",
-        errors.output.name,
-        height=300,
-    )
+    return Panel(x, [Row(y, marks)], f"Error of {name} over time", name, height=300)
 
 
 def _runs(outside: NDArray, edges: NDArray, rate: float) -> Iterator[tuple[float, float]]:

@@ -122,13 +122,7 @@ def _points(name: str, source: SourceResults, metrics: Sequence[str], lane: floa
     shown = [metric for metric in metrics if metric in source.scores]
     means = [source.mean(metric) for metric in shown]
     ends = [source.interval(m) or (mean, mean) for m, mean in zip(shown, means, strict=True)]
-    return Points(
-        means,
-        [metrics.index(metric) + lane for metric in shown],
-        source_name(name),
-        colour_of(name),
-        symbol(name),
-        ends=ends,
-        texts=[f"{mean_and_deviation(source.runs(m))} [{span(source.interval(m))}]" for m in shown],
-        size=10,
-    )
+    y = [metrics.index(metric) + lane for metric in shown]
+    texts = [f"{mean_and_deviation(source.runs(m))} [{span(source.interval(m))}]" for m in shown]
+    look = (source_name(name), colour_of(name), symbol(name))
+    return Points(means, y, *look, ends=ends, texts=texts, size=10)

@@ -100,18 +100,12 @@ def segment_figure(found: Segment) -> Figure:
         return Panel(Axis("time", "s", limits), [Row(Axis(name, found.unit), drawn)], alt, title)
 
     shown = [delay] if math.isfinite(error.delay) else []
-    alt = f"{output} in one segment, {tde}"
+    alt, below = f"{output} in one segment, {tde}", f"Residual in the same segment, {tpe}"
+    name = f"{output} minus nominal"
     panels = [
         panel("Whole trajectory", f"{output} over the whole trajectory", whole, output, both),
         panel(f"One segment: {tde}", alt, window, output, both, *shown),
-        panel(
-            f"Residual in this segment: {tpe}",
-            f"Residual in the same segment, {tpe}",
-            window,
-            f"{output} minus nominal",
-            missed,
-            offset,
-        ),
+        panel(f"Residual in this segment: {tpe}", below, window, name, missed, offset),
     ]
     keys = [Key("measured", "ink"), Key("nominal", "muted", "dot"), Key("in motion", "grid", "bar")]
     return Figure("movement", panels, keys)
