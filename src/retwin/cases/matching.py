@@ -74,6 +74,7 @@ def match_twin(
     taken += _units_taken(found.outputs, twin.outputs, outputs)
     if taken:
         text = f"the twin states no units of {', '.join(taken)}: taken as those of the log"
+        text += ", so that 100 % is 100 and not 1" * any("(%)" in each for each in taken)
         notes.setdefault(text, []).append(name)
     shape = (*found.observed.shape[:2], len(outputs))
     observed, mask = np.zeros(shape), np.zeros(shape, dtype=bool)

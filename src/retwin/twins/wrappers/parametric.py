@@ -346,7 +346,8 @@ class ParametricTwin(TwinWrapper):
         if differentiated is None:
             return None
         inner = self.inner(dict(zip(self.names, values, strict=True)))
-        return differentiated(commands, inner)[1] @ self.mixing
+        with np.errstate(invalid="ignore", over="ignore"):
+            return differentiated(commands, inner)[1] @ self.mixing
 
     @property
     def mixing(self) -> NDArray:
