@@ -232,8 +232,8 @@ def test_ghost_and_solid_differ(two_links: rt.Case, tmp_path: Path) -> None:
     still = np.zeros((1, 2))
 
     def shots(bend: float) -> Shots:
-        points = two_links.body.skeleton(still), two_links.body.skeleton(still + bend)
-        return Shots("", False, np.zeros(1), still, still + bend, *points)
+        poses = np.stack([still, still + bend])
+        return Shots("", False, np.zeros(1), poses, two_links.body.skeleton(poses))
 
     def drawn(bend: float) -> NDArray:
         with mujoco_pictures(shots(bend), two_links.body, SIZE) as found:

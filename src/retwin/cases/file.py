@@ -20,13 +20,7 @@ from retwin.cases.based_on import merge_bases, parameters_of, updated_built_in
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.named_signals import LogSettings
-from retwin.cases.named_twin import (
-    TwinKeys,
-    delayed_twin,
-    imported,
-    parametric_twin,
-    read_twin,
-)
+from retwin.cases.named_twin import TwinKeys, delayed_twin, imported, parametric_twin, read_twin
 from retwin.checks import agree, one_of, require
 from retwin.data.io import load
 from retwin.data.segments import Segments

@@ -11,21 +11,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 from retwin import twins
+from retwin.catalog import resolve
 from retwin.catalog.modules import import_beside
 from retwin.checks import at_most, existing, nothing, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.serialisation.configs import at, checked, from_settings, key
+from retwin.twins import FILES
 from retwin.twins.equations.state_twin import StateTwin
-from retwin.twins.fmu.twin import FMUTwin
 from retwin.twins.function import FunctionTwin
 from retwin.twins.limits import Limits
 from retwin.twins.mujoco.twin import MuJoCoTwin, Servo
 from retwin.twins.twin import Twin
 from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
 
-FILES: dict[str, Any] = {".fmu": FMUTwin, ".xml": MuJoCoTwin, ".urdf": MuJoCoTwin}
-"""The kind of twin that a file of each suffix holds."""
 ELSEWHERE = ("path", "function", "inputs", "outputs", "sensors", "rate", "limits")
 """Parameters of twins that other keys of a case.toml set."""
 
@@ -156,7 +155,7 @@ def _of_function(
 
 
 def _of_file(file: Path, keys: TwinKeys, options: dict[str, Any], place: str) -> Twin:
-    own, kind = key(place, "twin"), FILES[file.suffix.lower()]
+    own, kind = key(place, "twin"), resolve(FILES[file.suffix.lower()])
     existing(own, file, file.is_file(), "a file")
     chosen = {"inputs": keys.inputs, "outputs": keys.outputs}
     for name, channels in chosen.items():

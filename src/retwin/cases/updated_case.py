@@ -13,11 +13,11 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from retwin.cases.named_signals import Columns, LogSettings
-from retwin.cases.named_twin import FILES
 from retwin.cases.opened_twin import OpenedTwin
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.configs import toml_text
+from retwin.twins import FILES
 from retwin.twins.commands.record_sampler import moves_and_rests
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics import state_names

@@ -52,7 +52,11 @@ __getattr__, __dir__, __all__ = names(__name__, _HOME)
 __all__ += ["get"]
 
 FORMS = "package.module:object, *.fmu, *.xml or *.urdf"
-FILES = (".fmu", ".xml", ".urdf")
+FILES = {
+    ".fmu": f"{__name__}.fmu.twin:FMUTwin",
+    **dict.fromkeys((".xml", ".urdf"), f"{__name__}.mujoco.twin:MuJoCoTwin"),
+}
+"""The kind of twin that a file of each suffix holds."""
 
 
 def get(
@@ -114,12 +118,7 @@ def get(
         options["rate"] = rate
     if suffix == ".fmu":
         _check_none(name, {each: options[each] for each in ("meshes", "servos") if each in options})
-        from retwin.twins.fmu.twin import FMUTwin
-
-        return FMUTwin.from_file(name, outside=outside, **options)
-    from retwin.twins.mujoco.twin import MuJoCoTwin
-
-    return MuJoCoTwin.from_file(name, outside=outside, **options)
+    return resolve(FILES[suffix]).from_file(name, outside=outside, **options)
 
 
 def _check_none(name: str, options: Mapping[str, Any]) -> None:

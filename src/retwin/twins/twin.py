@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -391,9 +391,6 @@ def simulate_in_chunks(
 class ChunkedTwin:
     """The base of twins that simulate some trajectories at a time, by their method `_run`."""
 
-    _chunk: ClassVar[int] = 128
-    """Trajectories that are simulated together, at most."""
-
     def simulate(
         self,
         commands: NDArray,
@@ -404,7 +401,7 @@ class ChunkedTwin:
     ) -> Trajectories:
         """See `Twin.simulate`."""
         twin: Any = self  # with the channels and the rate of the subclass
-        how: Any = {"size": self._chunk, "emulated": getattr(self, "emulated", False)}
+        run, emulated = twin._run, getattr(self, "emulated", False)
         return simulate_in_chunks(
-            twin, twin._run, commands, faults, seed=seed, progress=progress, **how
+            twin, run, commands, faults, seed=seed, progress=progress, emulated=emulated
         )

@@ -192,17 +192,9 @@ def _choose(trajectories: Trajectories, case: Case, index: int | str) -> Traject
 def _shots(one: Trajectories, body: Body, fps: float) -> Shots:
     """Poses and skeletons at the times of the frames."""
     at = _samples(one, fps)
-    seconds = np.arange(len(at)) / fps
-    nominal, observed = (joints[0, at] for joints in body.poses(one))
-    return Shots(
-        title=" · ".join(filter(None, (one.ids[0], one.labels[0].replace("_", " ")))),
-        emulated=one.emulated,
-        seconds=seconds,
-        nominal=nominal,
-        observed=observed,
-        nominal_points=body.skeleton(nominal),
-        observed_points=body.skeleton(observed),
-    )
+    poses = np.stack([joints[0, at] for joints in body.poses(one)])
+    title = " · ".join(filter(None, (one.ids[0], one.labels[0].replace("_", " "))))
+    return Shots(title, one.emulated, np.arange(len(at)) / fps, poses, body.skeleton(poses))
 
 
 def _samples(one: Trajectories, fps: float) -> NDArray:

@@ -159,8 +159,8 @@ def _draw_scene(
             line(colour, thick, zorder + 2, alpha=alpha, marker="o", markersize=1.7 * thick * unit),
         )
         for points, colour, alpha, thick, zorder in (
-            (shots.nominal_points, GHOST, 0.55, 5.0, 3),
-            (shots.observed_points, SOLID, 1.0, 4.0, 4),
+            (shots.points[0], GHOST, 0.55, 5.0, 3),
+            (shots.points[1], SOLID, 1.0, 4.0, 4),
         )
     ]
     trails = [line(UPDATED, 0.8, 4, alpha=0.6) for _ in shots.drawn]

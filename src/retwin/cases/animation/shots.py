@@ -31,9 +31,9 @@ class Shots:
         Whether a model made the data that stand in for measurements.
     seconds : ndarray, shape (frames,)
         Times in s.
-    nominal, observed : ndarray, shape (frames, joints)
-        Joint positions in rad or m.
-    nominal_points, observed_points : ndarray, shape (frames, k, 3)
+    poses : ndarray, shape (2, frames, joints)
+        Joint positions in rad or m, nominal and observed.
+    points : ndarray, shape (2, frames, k, 3)
         Points of the skeleton in m.
     drawn : ndarray, shape (draws, frames, 3), optional
         Positions of the tip in m that an updated twin draws; by default there are none.
@@ -43,10 +43,8 @@ class Shots:
     title: str
     emulated: bool
     seconds: NDArray
-    nominal: NDArray
-    observed: NDArray
-    nominal_points: NDArray
-    observed_points: NDArray
+    poses: NDArray
+    points: NDArray
     drawn: NDArray = field(default_factory=lambda: np.empty((0, 0, 3)))
 
     def __len__(self) -> int:
@@ -67,12 +65,12 @@ class Shots:
     @property
     def root(self) -> NDArray:
         """Position (3,) of the base of the chain in m."""
-        return self.nominal_points[0, 0]
+        return self.points[0, 0, 0]
 
     @property
     def reach(self) -> float:
         """Largest possible distance from root to tip in m."""
-        links = np.diff(self.nominal_points, axis=1)
+        links = np.diff(self.points[0], axis=1)
         return float(np.linalg.norm(links, axis=2).sum(axis=1).max())
 
     @property

@@ -119,7 +119,7 @@ def _pictures(
         Number of frames per task: enough to hide the transfer, few enough to show progress.
 
     """
-    poses = np.stack([shots.nominal, shots.observed], axis=1)
+    poses = shots.poses.swapaxes(0, 1)
     for first in range(0, len(shots), frames_per_task):
         some = poses[first : first + frames_per_task]
         yield from pool.schedule(_draw, (stage, some), timeout=TIMEOUT).result()
