@@ -139,9 +139,9 @@ def read(
         See `rt.load`.
 
     """
+    options: Any = {"max_bytes": max_bytes, "mapping": mapping}
     if not isinstance(files, Path):
-        given = {"part": part, "max_bytes": max_bytes, "mapping": mapping}
-        sets = [read(file, case, rate, **given) for file in files]  # type: ignore[arg-type]
+        sets = [read(file, case, rate, part=part, **options) for file in files]
         return sets[0] if len(sets) == 1 else Trajectories.concatenate(sets)
     file = files
     log = mapping is None and file.exists() and (is_log(file) or file.is_dir())
@@ -162,14 +162,8 @@ def read(
         both = [found.trajectories, found.test]
         return found.test if part == "test" else Trajectories.concatenate(both)
     with bar("read") as show:
-        return load(
-            file,
-            case=case,
-            rate=rate,
-            progress=lambda share: show(file.name, share),
-            max_bytes=max_bytes,
-            mapping=mapping,
-        )
+        report = partial(show, file.name)
+        return load(file, case=case, rate=rate, progress=report, **options)
 
 
 def log_reader(file: Path, case: Any, twin: Twin, max_bytes: int | None = None) -> LogReader:

@@ -215,14 +215,9 @@ def _panel(
         Line(time, bands[2], "after, median", colour, width=1.2),
         Line(time, measured, "measured", "ink", width=1.5),
     ]
-    limits = float(time[0]), float(time[-1])
-    return Panel(
-        Axis("time", "s", limits),
-        [Row(Axis(name, unit), marks)],
-        f"{name} in {where}: measured, before and after the update",
-        f"{name} in {where}",
-        height=270,
-    )
+    x, title = Axis("time", "s", (float(time[0]), float(time[-1]))), f"{name} in {where}"
+    alt = f"{title}: measured, before and after the update"
+    return Panel(x, [Row(Axis(name, unit), marks)], alt, title, height=270)
 
 
 def _bars(study: Study, pair: tuple[str, str]) -> Panel | None:
@@ -253,10 +248,7 @@ def _bars(study: Study, pair: tuple[str, str]) -> Panel | None:
     shown = "" if unit == "σ" else unit
     simulated = study.results.overlay is None
     title = "Root mean square error" if simulated else "Mean absolute error, healthy runs"
-    return Panel(
-        Axis("", limits=(-0.6, len(names) - 0.4), kind="names", ticks=ticks),
-        [Row(Axis("error" if unit != "σ" else "error / σ", shown, from_zero=True), marks)],
-        f"{title}, each output, before and after the update",
-        title,
-        height=270,
-    )
+    x = Axis("", limits=(-0.6, len(names) - 0.4), kind="names", ticks=ticks)
+    y = Axis("error" if unit != "σ" else "error / σ", shown, from_zero=True)
+    alt = f"{title}, each output, before and after the update"
+    return Panel(x, [Row(y, marks)], alt, title, height=270)

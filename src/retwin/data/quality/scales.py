@@ -23,14 +23,11 @@ def find_scales(records: Trajectories) -> Iterator[Finding]:
     for channels, values in ((records.inputs, commands), (records.outputs, measured)):
         for k, name in enumerate(channels.names):
             known = [own[np.isfinite(own)] for own in values[..., k].astype(float)]
-            low, high, size = np.transpose(
-                [
-                    (*np.quantile(own, [0.02, 0.98]), np.quantile(np.abs(own), 0.98))
-                    if len(own)
-                    else np.full(3, np.nan)
-                    for own in known
-                ]
-            )
+            ends = np.full((len(known), 3), np.nan)
+            for row, own in zip(ends, known, strict=True):
+                if len(own):
+                    row[:] = *np.quantile(own, [0.02, 0.98]), np.quantile(np.abs(own), 0.98)
+            low, high, size = ends.T
             powers = [each for each in map(_powers, (size, high - low)) if each is not None]
             for i in range(len(records) if powers else 0):
                 power = {int(each[i]) for each in powers}

@@ -34,15 +34,9 @@ def delta(study: Study) -> Section | None:
             Line(x, y, "learned", colour, width=2),
         ]
         title = f"Equation of {equation}, over {variable}"
-        panels.append(
-            Panel(
-                Axis(variable, unit, (float(x[0]), float(x[-1]))),
-                [Row(Axis(f"change of the rate of {equation}", slope), marks)],
-                f"Learned discrepancy: {title}",
-                title,
-                height=300,
-            )
-        )
+        along = Axis(variable, unit, (float(x[0]), float(x[-1])))
+        row = Row(Axis(f"change of the rate of {equation}", slope), marks)
+        panels.append(Panel(along, [row], f"Learned discrepancy: {title}", title, height=300))
     keys = [
         Key("learned", colour),
         Key("90 % band", colour, "bar"),

@@ -203,14 +203,10 @@ def _bands(study: Study, source: str, name: str) -> Figure:
                 *draw_bands(time, factor * quantiles[i, :, :, c], colour_of(source)),
                 Line(time, factor * residual[i, :, c], "measured", "ink", width=1.6),
             ]
-            first = trajectory == parts["ids"][0]
-            panel = Panel(
-                Axis("time", "s", (time[0], time[-1])),
-                [Row(Axis(f"{output} minus nominal", unit), marks)],
-                f"{output} of trajectory {trajectory} within the bands of the draws",
-                f"{output}, {'typical' if first else 'worst'} ({trajectory})",
-                height=280,
-            )
-            panels.append(panel)
+            which = "typical" if trajectory == parts["ids"][0] else "worst"
+            x = Axis("time", "s", (time[0], time[-1]))
+            row = Row(Axis(f"{output} minus nominal", unit), marks)
+            alt = f"{output} of trajectory {trajectory} within the bands of the draws"
+            panels.append(Panel(x, [row], alt, f"{output}, {which} ({trajectory})", height=280))
     keys = [Key("measured", "ink"), Key("90 % and 50 % of the draws", colour_of(source), "bar")]
     return Figure(name, panels, keys, source, columns=len(each.outputs))

@@ -46,10 +46,6 @@ def _panel(study: Study, source: str) -> Panel:
         Line(x, y, "perfectly calibrated", colour, **perfect),
         Points(found.confidence, found.accuracy, title, colour, symbol(source)),
     ]
-    return Panel(
-        Axis("confidence", **share),
-        [Row(Axis("share of correct diagnoses", **share), marks)],
-        f"{title}: share of correct diagnoses against their confidence",
-        title,
-        height=300,
-    )
+    row = Row(Axis("share of correct diagnoses", **share), marks)
+    alt = f"{title}: share of correct diagnoses against their confidence"
+    return Panel(Axis("confidence", **share), [row], alt, title, height=300)

@@ -66,10 +66,7 @@ def _panel(study: Study, sources: list[str], record: int, output: int) -> Panel:
         below.append(Line(time, mean - observed, *look))
     above.append(Line(time, observed, "measured", "ink", width=1.3))
     record_id = str(arrays["simulation/ids"][record])
-    return Panel(
-        Axis("time", "s", (time[0], time[-1]), count=8),
-        [Row(Axis(name, unit), above), Row(Axis("error", unit, count=5), below)],
-        f"{name} of record {record_id}, measured and simulated, and the error",
-        f"{name} ({record_id})",
-        height=480,
-    )
+    x = Axis("time", "s", (time[0], time[-1]), count=8)
+    rows = [Row(Axis(name, unit), above), Row(Axis("error", unit, count=5), below)]
+    alt = f"{name} of record {record_id}, measured and simulated, and the error"
+    return Panel(x, rows, alt, f"{name} ({record_id})", height=480)
