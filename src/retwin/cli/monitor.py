@@ -99,7 +99,8 @@ def fit(
         return
     known = DynamicsTwin.load(model) if model else None
     system = case_named(case or (known.case if known else None) or None)
-    if known is None and system is None and mapping is None and _tables(healthy):
+    tables = all(each.suffix.lower() == ".csv" for each in healthy)
+    if known is None and system is None and mapping is None and tables:
         records = [read_signals(healthy, max_bytes)]
     else:
         records = [
@@ -372,10 +373,6 @@ def recalibrate(
         version = propose(opened, asset, hours=hours, new_normal=new_normal)
     text = f"Version {version.number}, of {version.reason}, is in the shadow of the active one."
     answer(vars(version), text, as_json=as_json)
-
-
-def _tables(files: Sequence[Path]) -> bool:
-    return all(each.suffix.lower() == ".csv" for each in files)
 
 
 def _named(twin: DynamicsTwin | None) -> TwinData | None:

@@ -33,7 +33,7 @@ from retwin.monitor.store.samples import SECOND
 from retwin.monitor.versions.registry import Registry
 from retwin.twins.faults.actuator_faults import Fault
 
-Faults = Callable[[str], "dict[str, Fault | None] | None"]
+Faults = Callable[[str], "Mapping[str, Fault | None] | None"]
 """The known faults of a twin by its name; None for any change."""
 
 
