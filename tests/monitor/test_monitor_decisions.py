@@ -291,16 +291,21 @@ def test_what_a_stream_logs_and_counts(
 ) -> None:
     machine = Stream().machine
     work = Work(0, 0, np.ones((2, 2)), True)
-    both = np.zeros((2, 1))
-    found = {"mean": both, "deviation": both, "evidence": np.zeros(2), "outside": np.array(False)}
-    found |= {"event": np.array([True, True]), "void": np.array([False, False])}
+    both = np.zeros((1, 2, 1))
+    found = {"mean": both, "deviation": both, "evidence": np.zeros((1, 2))}
+    found |= {"event": np.array([[True, True]]), "outside": np.array([False])}
     alarm = Alarm("a", 1, 1.0, "level", "higher than predicted", 1e6, event, promised)
     endings = [Ending("a", 1, 1, FOLLOWS)] if ends else []
-    machine.stepped(work, np.zeros(1), found, [alarm], endings)
+
+    def step(alarms: list[Alarm], endings: list[Ending], *void: bool) -> None:
+        watched = SimpleNamespace(**found, alarms=alarms, endings=endings, void=np.array([void]))
+        machine.stepped(work, np.zeros(1), watched, 0)  # type: ignore[arg-type]
+
+    step([alarm], endings, False, False)
     assert ([kind for kind, _ in machine.entries], machine.alarms) == (log, counted)
     assert machine.event is not ends
-    for void in ([False, True], [True, True]):  # is logged once
-        machine.stepped(work, np.zeros(1), found | {"void": np.array(void)}, [], [])
+    for void in ((False, True), (True, True)):  # is logged once
+        step([], [], *void)
     assert [kind for kind, _ in machine.entries].count("void") == 1
 
 
