@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 import retwin as rt
-from retwin.cli.monitor import _written
+from retwin.cli.monitor import _event_rows, _written
 from retwin.monitor import Alarm
 from retwin.monitor.models.cause import Cause
 from retwin.twins import ParameterShift
@@ -31,12 +33,32 @@ def test_a_monitor_is_calibrated_and_its_promise_printed(watched: Path, call, tm
     assert code == 2
 
 
-def test_an_alarm_without_a_cause_is_written_without_its_time() -> None:
+def test_a_cause_is_written_with_its_time_size_and_probability_where_it_has_them() -> None:
     nothing, alarm = (np.nan,) * 3, Alarm("tank", 3, 3.0, "level", "higher than predicted", 1e6, 3)
     named = {"leaking": 0.3, "Healthy": 0.7}
-    assert _written(Cause(alarm, "Healthy", 0.7, 0.9, nothing, nothing, named)) == "no known fault"
-    onset = (2.0, 1.0, 3.0)
-    assert _written(Cause(alarm, "leaking", 0.7, 0.0, onset, onset, named)) == "leaking from 2 s"
+    none = Cause(alarm, "Healthy", 0.7, 0.9, nothing, nothing, named)
+    assert _written(none) == "no known fault; probability 0.70"
+    leaking = Cause(alarm, "leaking", 0.7, 0.0, (0.2, 0.1, 0.3), (2.0, 1.0, 3.0), named, unit="1/s")
+    assert _written(leaking) == "leaking from 2 s; size 0.2 1/s (0.1 to 0.3), probability 0.70"
+    frozen = replace(leaking, size=nothing, unit="")
+    assert _written(frozen) == "leaking from 2 s; probability 0.70"
+
+
+def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:
+    first = Alarm("tank", 3, 3.0, "level", "higher than predicted", 1e6, 3)
+    watched = SimpleNamespace(events=[first], endings=[])
+    found = Cause(first, "leaking", 0.7, 0.0, (0.2, 0.1, 0.3), (2.0, 1.0, 3.0), {}, unit="1/s")
+    later = replace(found, probability=0.9, size=(0.25, 0.2, 0.3), same=True)
+    beside = replace(later, name="weak pump", probability=0.4)
+    within = replace(later, probability=0.8, onset=(3.1, 3.0, 4.0))
+    for more, text in (((later,), "0.25"), ((beside,), "0.2 "), ((within,), "0.2 ")):
+        (row,) = _event_rows(watched, [found, *more], 1.0)  # type: ignore[arg-type]
+        assert row[-1].startswith(f"leaking from 2 s; size {text.strip()} 1/s")
+    second = replace(within, name="weak pump", size=(-0.5, -0.6, -0.4), unit="", same=False)
+    (row,) = _event_rows(watched, [found, second], 1.0)  # type: ignore[arg-type]
+    assert row[-1].endswith(
+        "; then weak pump from 3.1 s; size -0.5 (-0.6 to -0.4), probability 0.80"
+    )
 
 
 @pytest.mark.slow
@@ -54,8 +76,10 @@ def test_a_leak_is_reported_with_its_time_and_cause(watched: Path, call) -> None
     assert "healthy.npz: 0 events in 0.111 measured hours." in printed
     assert "leaking from" in printed
     words = " ".join(printed.split())
-    assert "Seen, if all was healthy: 1 events in 0.222 h, at most one in" in words
-    assert "(exact 95 % bound). Promised under the model: at most one in" in words
+    assert "This replay of 13.3 minutes shows 1 events; if all was healthy, that alone" in words
+    assert "(exact 95 %). The promise of at most one false event in" in words
+    assert "probability 1.00" in words
+    assert first["cause"]["unit"] == "1/s"
 
 
 @pytest.mark.slow

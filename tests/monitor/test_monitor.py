@@ -325,10 +325,21 @@ def test_an_alarm_just_after_the_first_one_names_no_second_fault(monitor: Monito
     leaking = record(1, 5, faults=[ParameterShift("drain", size=1.3, onset=30.0)])
     alarms = monitor.watch(leaking).alarms[:2]
     assert alarms[1].sample - alarms[0].sample <= 10
+    first, further = find_causes(monitor.twin, leaking, alarms, possible_causes(monitor.twin))
+    assert (first.name, first.same) == ("drain changed", False)
+    assert further == replace(first, alarm=alarms[1], same=True)
+
+
+def test_a_wrong_cause_is_replaced_by_the_one_that_explains_the_event(monitor: Monitor) -> None:
+    leaking = record(1, 5, faults=[ParameterShift("drain", size=1.3, onset=30.0)])
+    first, *further = monitor.watch(leaking).alarms
+    alarms = [first, next(each for each in further if each.sample - first.sample > 10)]
     causes, other = possible_causes(monitor.twin), "pump: another effect"
-    cause = find_cause(monitor.twin, leaking, alarms, causes, current=other)
-    assert cause.name == "drain changed"
-    assert cause.same
+    for current, same in ((other, False), ("drain changed", True)):
+        cause = find_cause(monitor.twin, leaking, alarms, causes, current=current)
+        assert (cause.name, cause.same, cause.unit) == ("drain changed", same, "1/s")
+        assert cause.size[1] < 1.3 < cause.size[2]
+    assert cause.onset[0] < first.time
 
 
 @pytest.mark.slow

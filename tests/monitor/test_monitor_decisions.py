@@ -23,7 +23,7 @@ from retwin.monitor.live.status import AssetStatus
 from retwin.monitor.live.stream_machine import BEHIND, TOLERATED, WINDOW, StreamMachine, Work
 from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.models import cause, trajectories, visibility
-from retwin.monitor.models.cause import MIN_WINDOW, PROBABLE, cause_text
+from retwin.monitor.models.cause import MIN_WINDOW, PROBABLE, Cause, cause_text, is_due
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import BEYOND, Monitor
 from retwin.monitor.models.parts import Part
@@ -31,7 +31,7 @@ from retwin.monitor.models.trajectories import COMPARABLE, SHOWN, TrajectoryMoni
 from retwin.monitor.models.trajectory_evidence import Compared
 from retwin.monitor.models.visible import SHARE, Visible
 from retwin.monitor.models.watched import Alarm, Ending
-from retwin.monitor.server import views
+from retwin.monitor.server import journal, views
 from retwin.monitor.store.samples import Samples, Trajectory
 from retwin.monitor.store.updates import Asset
 from retwin.monitor.versions import comparison
@@ -293,16 +293,21 @@ def test_what_a_stream_logs_and_counts(
 ) -> None:
     machine = Stream().machine
     work = Work(0, 0, np.ones((2, 2)), True)
-    both = np.zeros((2, 1))
-    found = {"mean": both, "deviation": both, "evidence": np.zeros(2), "outside": np.array(False)}
-    found |= {"event": np.array([True, True]), "void": np.array([False, False])}
+    both = np.zeros((1, 2, 1))
+    found = {"mean": both, "deviation": both, "evidence": np.zeros((1, 2))}
+    found |= {"event": np.array([[True, True]]), "outside": np.array([False])}
     alarm = Alarm("a", 1, 1.0, "level", "higher than predicted", 1e6, event, promised)
     endings = [Ending("a", 1, 1, FOLLOWS)] if ends else []
-    machine.stepped(work, np.zeros(1), found, [alarm], endings)
+
+    def step(alarms: list[Alarm], endings: list[Ending], *void: bool) -> None:
+        watched = SimpleNamespace(**found, alarms=alarms, endings=endings, void=np.array([void]))
+        machine.stepped(work, np.zeros(1), watched, 0)  # type: ignore[arg-type]
+
+    step([alarm], endings, False, False)
     assert ([kind for kind, _ in machine.entries], machine.alarms) == (log, counted)
     assert machine.event is not ends
-    for void in ([False, True], [True, True]):  # is logged once
-        machine.stepped(work, np.zeros(1), found | {"void": np.array(void)}, [], [])
+    for void in ((False, True), (True, True)):  # is logged once
+        step([], [], *void)
     assert [kind for kind, _ in machine.entries].count("void") == 1
 
 
@@ -480,10 +485,11 @@ def found_cause(
     unknown: float,
     *,
     samples: tuple[int, ...] = (200, 300),
-    second: bool = False,
+    earlier: int | None = None,
+    better: bool = False,
     current: str = "leak",
-) -> tuple[bool, int]:
-    """Whether a further alarm is of the same cause, and the samples it was found from."""
+) -> tuple[bool, list[int]]:
+    """Whether a further alarm is of the same cause, and the windows that it was found from."""
     classes = ["Healthy", "leak", "pump"]
     steps: list[int] = []
 
@@ -501,16 +507,19 @@ def found_cause(
 
     monkeypatch.setattr(cause, "StateInversionDiagnoser", Diagnoser)
     monkeypatch.setattr(cause, "moved", lambda twin, _: twin)
-    monkeypatch.setattr(cause, "_second", lambda *_: second)
+    monkeypatch.setattr(cause, "size_unit", lambda *_: "")
+    monkeypatch.setattr(cause, "_better", lambda *_: better)
     alarms = [Alarm("0", each, float(each), "level", "", 1e6, samples[0]) for each in samples]
+    if earlier is not None:
+        alarms.insert(0, Alarm("0", earlier, float(earlier), "level", "", 1e6, earlier))
     faults = {"Healthy": None, "leak": LEAK, "pump": PUMP}
     record = recorded(0)
     made = cause.find_cause(None, record, alarms, faults, current=current)  # type: ignore[arg-type]
-    return made.same, steps[0]
+    return made.same, steps
 
 
 @pytest.mark.parametrize(
-    ("name", "probability", "unknown", "second", "same"),
+    ("name", "probability", "unknown", "better", "same"),
     [
         ("leak", 0.9, 0.0, True, True),  # the one that the event has
         ("Healthy", 0.9, 0.0, True, True),  # no other one
@@ -521,46 +530,113 @@ def found_cause(
         ("pump", 0.9, 0.5, True, True),  # not one of the classes
     ],
 )
-def test_a_further_alarm_of_an_event_has_a_cause_of_its_own_where_that_is_probable(
+def test_a_further_alarm_has_a_cause_of_its_own_where_that_is_probable_and_better(
     name: str,
     probability: float,
     unknown: float,
-    second: bool,
+    better: bool,
     same: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert found_cause(monkeypatch, name, probability, unknown, second=second)[0] is same
+    windows = [201] if probability * (1 - unknown) > PROBABLE else [201, 100]
+    found = found_cause(monkeypatch, name, probability, unknown, better=better)
+    assert found == (same, windows)
+    older = found_cause(monkeypatch, name, probability, unknown, samples=(200, 301), better=better)
+    assert older == (same, [101])
 
 
 def test_the_first_alarm_of_an_event_has_its_own_cause(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert found_cause(monkeypatch, "Healthy", 0.9, 0.0, samples=(200,)) == (False, 101)
+    assert found_cause(monkeypatch, "Healthy", 0.9, 0.0, samples=(200,)) == (False, [101])
 
 
 @pytest.mark.parametrize(
-    ("after", "steps", "same"),
-    [(MIN_WINDOW, 101, True), (MIN_WINDOW + 1, MIN_WINDOW + 1, False)],
+    ("after", "steps"),
+    [(1, MIN_WINDOW + 1), (MIN_WINDOW + 1, MIN_WINDOW + 1), (20, 20), (101, 101)],
 )
-def test_a_window_begins_after_an_alarm_that_leaves_it_enough(
-    after: int, steps: int, same: bool, monkeypatch: pytest.MonkeyPatch
+def test_a_window_begins_after_the_event_before_it(
+    after: int, steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = found_cause(monkeypatch, "pump", 0.9, 0.0, samples=(200, 200 + after), second=True)
-    assert found == (same, steps)
+    found = found_cause(monkeypatch, "pump", 0.9, 0.0, samples=(200,), earlier=200 - after)
+    assert found == (False, [steps])
+
+
+def test_a_window_begins_after_the_alarm_that_was_explained(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = found_cause(monkeypatch, "pump", 0.9, 0.0, samples=(200, 280, 320), better=True)
+    assert found == (False, [40])
 
 
 @pytest.mark.parametrize(
-    ("until", "again", "previous", "second"),
+    ("inferred", "sample", "due"),
     [
-        (0.0, 12.0, 300, False),  # not more than the first fault alone, but for the penalty
-        (0.0, 12.1, 300, True),
-        (0.1, 12.0, 300, True),
-        (0.0, 0.0, 200 - 100 + MIN_WINDOW - 1, True),  # too little before to tell
-        (0.0, 0.0, 200 - 100 + MIN_WINDOW, False),
+        ([], 200, True),
+        ([200], 200 + MIN_WINDOW, False),
+        ([200], 200 + MIN_WINDOW + 1, True),
+        ([200, 240], 250, False),
+        ([200, 240], 251, True),
+        ([200, 240, 260], 275, False),
+        ([200, 240, 260], 276, True),
     ],
 )
-def test_a_second_fault_has_more_evidence_than_the_first_alone(
-    until: float, again: float, previous: int, second: bool, monkeypatch: pytest.MonkeyPatch
+def test_a_cause_is_inferred_again_when_its_event_is_a_quarter_older(
+    inferred: list[int], sample: int, due: bool
 ) -> None:
-    values = iter([until, -1e6, 0.0, 10.0, again])
+    assert is_due(inferred, sample) is due
+
+
+def test_alarms_at_which_nothing_is_inferred_have_the_cause_of_their_event(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An event of any length has few inferences; the next one begins after its last alarm."""
+    asked: list[list[int]] = []
+
+    def found(
+        _twin: object, _record: object, alarms: list[Alarm], *_: object, **__: object
+    ) -> Cause:
+        asked.append([each.sample for each in alarms])
+        return Cause(alarms[-1], f"{len(asked)}", 1.0, 0.0, *[(0.0,) * 3] * 2, {}, len(asked) == 2)
+
+    monkeypatch.setattr(cause, "find_cause", found)
+    record = recorded(0)
+    (name,) = record.ids.tolist()
+    alarms = [Alarm(name, each, float(each), "level", "", 1e6, 200) for each in range(200, 380, 5)]
+    alarms.append(Alarm(name, 395, 395.0, "level", "", 1e6, 395))
+    causes = cause.find_causes(None, record, alarms, {})  # type: ignore[arg-type]
+    inferred = [200, 215, 230, 245, 260, 280, 305, 335, 370]
+    assert asked == [*(inferred[: i + 1] for i in range(9)), [375, 395]]
+    assert [each.alarm for each in causes] == alarms
+    assert [each.alarm.sample for each in causes if not each.same] == [200, *inferred[2:], 395]
+    assert [each.name for each in causes[:7]] == ["1", "1", "1", "2", "2", "2", "3"]
+
+
+@pytest.mark.parametrize(
+    ("until", "again", "instead", "begin", "better"),
+    [
+        (0.0, 12.0, None, 300, False),  # not more than the first fault alone, but for the penalty
+        (0.0, 12.1, None, 300, True),
+        (0.1, 12.0, None, 300, True),
+        (0.0, 100.0, None, 100 + MIN_WINDOW - 1, False),  # too little before to tell
+        (0.0, 100.0, None, 100 + MIN_WINDOW, True),
+        (0.0, -1e6, 10.0, 300, False),  # not more than the first fault
+        (0.0, -1e6, 10.1, 300, True),
+        (0.0, -1e6, -1e6, 100 + MIN_WINDOW - 1, True),  # all there is is the window
+    ],
+)
+@pytest.mark.parametrize("alone", ["lasts", "ended", "states unknown again"])
+def test_another_fault_has_more_evidence_than_the_first_alone(
+    alone: str,
+    until: float,
+    again: float,
+    instead: float | None,
+    begin: int,
+    better: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = {"until": until, "lasts": -1e6, "ended": -1e6, "as it was": 0.0}
+    known |= {"states unknown again": -1e6, "again": again, "instead": instead}
+    known[alone] = 10.0 if alone == "lasts" else 10.0 - until
+    values = iter(known.values())
 
     class Model:
         def integral(self, _: object) -> object:
@@ -571,10 +647,9 @@ def test_a_second_fault_has_more_evidence_than_the_first_alone(
 
     monkeypatch.setattr(cause, "FaultEvidence", SimpleNamespace(of=lambda *_, **__: Model()))
     monkeypatch.setattr(cause, "moved", lambda twin, _: twin)
-    samples = (200, previous, 310)
-    alarms = [Alarm("0", each, float(each), "level", "", 1e6, 200) for each in samples]
-    own = (LEAK, PUMP)
-    assert cause._second(None, recorded(0), alarms, own, 2.0) is second  # type: ignore[arg-type]
+    window = (100, begin, Alarm("0", 310, 310.0, "level", "", 1e6, 200))
+    given = None, recorded(0), window, (LEAK, PUMP), 2.0, instead is not None
+    assert cause._better(*given) is better  # type: ignore[arg-type]
 
 
 # What a monitor sees.
@@ -605,6 +680,24 @@ def test_a_machine_has_stopped_after_a_time_without_samples(
     status = AssetStatus("a", "tank", 1, 5, 0.1, 0, None, False, False, False, "", {})
     found = views.Views._status(own, status, {}, {})  # type: ignore[arg-type]
     assert (found["state"], found["idle"]) == (state, pytest.approx(idle))
+
+
+@pytest.mark.parametrize(
+    ("name", "onset", "refines"),
+    [
+        ("leak", 9 * SECOND, True),
+        ("leak", 10 * SECOND, True),
+        ("leak", 11 * SECOND, False),  # it is inferred from what came last
+        ("leak", None, False),
+        ("pump", 9 * SECOND, False),
+    ],
+)
+def test_the_cause_that_opened_an_event_becomes_more_certain(
+    name: str, onset: int | None, refines: bool
+) -> None:
+    found = {"name": name, "onset": [onset] * 3}
+    assert journal._refines(found, {"time": 10.0, "cause": {"name": "leak"}}) is refines
+    assert not journal._refines(found, {"time": 10.0, "cause": None})
 
 
 # Versions.

@@ -86,7 +86,6 @@ def fit(
     Without MODEL a black box of the records takes the place of a twin.
     """
     from retwin.monitor import fit_monitor, possible_causes, visible_sizes
-    from retwin.monitor.detect.promise import duration
     from retwin.update import DynamicsTwin
 
     check_place(out, folder=True, holds=("model.json", "weights.safetensors", "twin", "diagnoser"))
@@ -100,7 +99,8 @@ def fit(
         return
     known = DynamicsTwin.load(model) if model else None
     system = case_named(case or (known.case if known else None) or None)
-    if known is None and system is None and mapping is None and _tables(healthy):
+    tables = all(each.suffix.lower() == ".csv" for each in healthy)
+    if known is None and system is None and mapping is None and tables:
         records = [read_signals(healthy, max_bytes)]
     else:
         records = [
@@ -131,7 +131,7 @@ def fit(
         | {"records": checked.values, "visible": [vars(each) for each in made.visible]},
         *shown_records(checked),
         *([] if known else [box]),
-        f"Promised under the model: {duration(made.run_length / twin.rate)} to a false event.",
+        _promised(made),
         f"Tried: {tried}",
         *(f"{name}: {text}" for name, text in promises.items()),
         *map(str, made.visible),
@@ -375,10 +375,6 @@ def recalibrate(
     answer(vars(version), text, as_json=as_json)
 
 
-def _tables(files: Sequence[Path]) -> bool:
-    return all(each.suffix.lower() == ".csv" for each in files)
-
-
 def _named(twin: DynamicsTwin | None) -> TwinData | None:
     """What `read` takes for a case: the twin by whose channels the columns of a table are named."""
     from retwin.cases.twin_data import TwinData
@@ -414,11 +410,15 @@ def _causes(
 
 
 def _written(cause: Cause) -> str:
-    """A cause with its onset, and whether there is more to it."""
+    """A cause with its onset, size and probability, and whether there is more to it."""
     from retwin.monitor.models.cause import cause_text
 
     since = "" if isnan(cause.onset[0]) else f"{cause.onset[0]:.6g} s"
-    return cause_text(cause.name, since, cause.unknown)
+    value, low, high = cause.size
+    of = f" {cause.unit}" if cause.unit else ""
+    size = "" if isnan(value) else f"size {value:.3g}{of} ({low:.3g} to {high:.3g}), "
+    text = cause_text(cause.name, since, cause.unknown)
+    return f"{text}; {size}probability {cause.probability:.2f}"
 
 
 def _event_rows(
@@ -428,17 +428,19 @@ def _event_rows(
     ends = {(each.trajectory, each.event): each for each in watched.endings}
     rows = []
     for first in watched.events:
-        names = [
-            _written(cause)
-            for cause in causes
-            if (cause.alarm.trajectory, cause.alarm.event) == (first.trajectory, first.event)
-            and not cause.same
-        ]
+        named: list[Cause] = []
+        for cause in causes:
+            if (cause.alarm.trajectory, cause.alarm.event) != (first.trajectory, first.event):
+                continue
+            if not cause.same:
+                named.append(cause)
+            elif cause.name == named[-1].name and cause.onset[0] <= first.time:
+                named[-1] = cause  # the same from more samples
         end = ends.get((first.trajectory, first.event))
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
-        cause = "; then ".join(names)
-        rows.append((first.trajectory, f"{first.time:.6g}", until, what, cause))
+        cause_names = "; then ".join(map(_written, named))
+        rows.append((first.trajectory, f"{first.time:.6g}", until, what, cause_names))
     return rows
 
 
@@ -471,7 +473,7 @@ def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
 
 
 def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> str:
-    """The rate that was seen, with its exact bound, and the one that is promised."""
+    """What a replay shows of the rate of false events, with its exact bound, and the promise."""
     from retwin.monitor.detect.promise import duration, shortest
 
     rate = monitor.twin.rate
@@ -479,10 +481,19 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     events = sum(each.promised for _, watched in found for each in watched.events)
     bound = duration(shortest(events, samples) / rate)
     return (
-        f"Seen, if all was healthy: {events} events in {samples / rate / 3600:.3g} h, at most one "
-        f"in {bound} (exact 95 % bound). Promised under the model: at most one in "
-        f"{duration(monitor.run_length / rate)}."
+        f"This replay of {duration(samples / rate)} shows {events} events; if all was healthy, "
+        f"that alone bounds their rate at one in {bound} (exact 95 %). {_promised(monitor)}"
     )
+
+
+def _promised(monitor: Monitor) -> str:
+    """The rate that is promised, and what it follows from."""
+    from retwin.monitor.detect.promise import duration
+
+    known = monitor.tried.kept(monitor.arl)
+    source = "the model of the noise" if known else "the events of records that were left out"
+    wanted = duration(monitor.run_length / monitor.twin.rate)
+    return f"The promise of at most one false event in {wanted} follows from {source}."
 
 
 def _json(file: Path, record: Trajectories, watched: Watched, causes: list[Cause]) -> dict:

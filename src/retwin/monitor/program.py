@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -35,7 +34,6 @@ from retwin.monitor.settings import (
     MonitorSettings,
     MqttSource,
     NotifySettings,
-    ServerSettings,
     TwinSettings,
     secret,
 )
@@ -49,7 +47,6 @@ from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
 from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 from retwin.serialisation.files import sha256
-from retwin.twins.faults.actuator_faults import Fault
 
 INTERVAL = 0.5
 """Seconds after which new entries of the log are reported."""
@@ -78,8 +75,9 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
 
     """
     with ExitStack() as opened:
-        bound = settings.server and opened.enter_context(_bound(settings.server))
-        token = check_token(_token(settings.server)) if settings.server else ""
+        page = settings.server
+        token = check_token(secret("token", page.token_env, page.token_file)) if page else ""
+        bound = page and opened.enter_context(listening(page.host, page.port))
         for twin in settings.twins.values():
             load_monitor(twin.monitor)
         store = Store(settings.store, settings.url, max_samples=settings.max_samples)
@@ -94,7 +92,8 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
         opened.callback(news.read)
         twins = {each.twin: live.monitor(name) for name, each in settings.assets.items()}
         systems = {name: _case(settings.twins[name], each) for name, each in twins.items()}
-        explanations = Explanations(live, lambda twin: _faults(systems.get(twin)))
+        faults = {name: each.alarm_causes for name, each in systems.items() if each}
+        explanations = Explanations(live, faults.get)
         opened.enter_context(explanations)
         receivers = [_receiver(name, each) for name, each in settings.notify.items()]
         opened.enter_context(Notifications(store, receivers, report))
@@ -104,12 +103,12 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
             for each in settings.sources
             for source in _sources(each, settings, live, systems, report)
         ]
-        if settings.server and bound:
+        if page and bound:
             app = create_app(
                 live,
                 gate,
                 token=token,
-                hosts=settings.server.hosts,
+                hosts=page.hosts,
                 explanations=explanations,
                 sources={each.name: partial(getattr, each, "connected") for each in sources},
             )
@@ -166,16 +165,6 @@ def _offer(registry: Registry, twin: TwinSettings, report: Callable[[str], None]
         number = {each.digest: each.number for each in registry.versions()}[sha256(folder)]
         registry.promote(number)
         report(f"twin {registry.twin}: {twin.monitor} is version {number}")
-
-
-def _bound(server: ServerSettings) -> socket.socket:
-    """The socket of the page; InputError if its token is missing or its port is in use."""
-    _token(server)
-    return listening(server.host, server.port)
-
-
-def _token(server: ServerSettings) -> str | None:
-    return secret("token", server.token_env, server.token_file)
 
 
 def _receiver(name: str, settings: NotifySettings) -> Receiver:
@@ -247,10 +236,6 @@ def _folders(
     if recorded:
         made.append(TrajectoryFolder(settings, recorded, newest, report))
     return made
-
-
-def _faults(case: Case | None) -> dict[str, Fault | None] | None:
-    return None if case is None else dict(case.alarm_causes)
 
 
 def _case(twin: TwinSettings, monitor: AnyMonitor) -> Case | None:

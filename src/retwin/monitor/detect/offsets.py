@@ -108,12 +108,7 @@ class OffsetModel:
 
     def arrays(self) -> dict[str, NDArray]:
         """Arrays by name."""
-        return {
-            "offset_mean": self.mean,
-            "offset_deviation": self.deviation,
-            "offset_kappa": self.kappa,
-            "offset_degrees": self.degrees,
-        }
+        return {f"offset_{name}": each for name, each in vars(self).items()}
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray], actuators: int) -> OffsetModel | None:

@@ -163,8 +163,8 @@ class Tried:
         count, hours = sum(self.events.values()), sum(self.samples.values()) / rate / 3600
         text = (
             f"Of {len(self.events)} parts of the calibration, each left out in turn, {count} "
-            f"events in {hours:.3g} h: at most one in {duration(self.run_length / rate)} (exact "
-            "95 % bound)"
+            f"events in {hours:.3g} h, which alone bounds their rate at one in "
+            f"{duration(self.run_length / rate)} (exact 95 %)"
         )
         if count:
             text += f"; {self.events[worst]} of them in {worst}: records of more days would help"

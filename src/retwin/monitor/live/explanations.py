@@ -19,10 +19,10 @@ from retwin.monitor.live.live import Live
 from retwin.monitor.models.cause import (
     BEFORE,
     EVENT,
-    MIN_WINDOW,
     Cause,
     cause_data,
     find_cause,
+    is_due,
     possible_causes,
 )
 from retwin.monitor.models.monitor import Monitor
@@ -33,7 +33,7 @@ from retwin.monitor.store.samples import SECOND
 from retwin.monitor.versions.registry import Registry
 from retwin.twins.faults.actuator_faults import Fault
 
-Faults = Callable[[str], "dict[str, Fault | None] | None"]
+Faults = Callable[[str], "Mapping[str, Fault | None] | None"]
 """The known faults of a twin by its name; None for any change."""
 
 
@@ -71,12 +71,12 @@ class _Turns(queue.Queue["list[Entry] | None"]):
 
 
 class Explanations:
-    """A thread that explains each alarm from the stored samples before it.
+    """A thread that explains alarms from the stored samples before them.
 
     Machines take turns, and of each machine the newest event is explained first. A context manager
     that ends the thread. What is found is an entry `cause` of the log; of further alarms of an
-    event it tells whether the fault is the `same`, see `find_cause`. Alarms that have none, since
-    the program was stopped, are explained when it is started again.
+    event, where one is due (`is_due`), it tells whether the fault is the `same`, see `find_cause`.
+    Alarms that lack theirs, since the program was stopped, are explained when it is started again.
 
     Parameters
     ----------
@@ -100,7 +100,8 @@ class Explanations:
         self._faults = faults
         self._report = report
         self._queue = _Turns()
-        self._alarms: dict[str, list[Entry]] = {}
+        self._alarms: dict[str, tuple[list[Entry], Entry | None]] = {}
+        """Of each machine the alarms that its event is explained by, and the newest one."""
         self._current: dict[tuple[str, int], str] = {}
         """The cause of each event, by its machine and time."""
         self._closed = threading.Event()
@@ -145,20 +146,23 @@ class Explanations:
     def _take(
         self, alarms: Iterable[Entry], explained: Mapping[int, dict[str, Any]] = NONE
     ) -> None:
-        """Queue alarms, each after the first and the newest of its event, or those before it."""
+        """Queue the alarms at which a cause is due, each after those that it is inferred with."""
         for entry in alarms:
-            asset = entry.data["asset"]
-            known = self._alarms.get(asset, [])
-            if known and known[0].data.get("version") != entry.data.get("version"):
-                known = []
+            data, asset = entry.data, entry.data["asset"]
+            known, newest = self._alarms.get(asset, ([], None))
+            if newest and newest.data.get("version") != data.get("version"):
+                known, newest = [], None
+            own = [each for each in known if _event(each.data) == _event(data)]
+            if not own:
+                known = [newest] if newest else []
+            self._last = entry.sequence
+            if is_due([each.data["sample"] for each in own], data["sample"]):
+                known = [*known, entry]
+                if "cause" not in data and entry.sequence not in explained:
+                    self._queue.put(known)
             if entry.sequence in explained:
                 self._keep(entry, explained[entry.sequence])
-            elif "cause" not in entry.data:
-                self._queue.put([*known, entry])
-            same = known and _event(known[0].data) == _event(entry.data)
-            newest = known[1:][-MIN_WINDOW:]
-            self._alarms[asset] = [*known[:1], *newest, entry] if same else [entry]
-            self._last = entry.sequence
+            self._alarms[asset] = known, entry
 
     def _keep(self, alarm: Entry, cause: dict[str, Any]) -> None:
         """Keep what the event of an alarm is explained by."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from retwin.monitor.live.layout import Layout
 from retwin.monitor.live.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.watched import Alarm, Ending, Watched
+from retwin.monitor.models.watched import Watched
 from retwin.monitor.store.limits import Limits
 from retwin.monitor.store.samples import SECOND, Samples
 from retwin.monitor.store.updates import EARLIEST, Asset, Update
@@ -113,8 +113,7 @@ class StreamMachine(Machine[Monitor]):
     @property
     def stepped_time(self) -> int:
         """A time in nanoseconds after which are all samples that were not stepped."""
-        assert self._origin is not None
-        return max(EARLIEST, self._origin + round((self._done - 0.5) * self._period))
+        return max(EARLIEST, self._moment(self._done - 0.5))
 
     def unsure(self, times: NDArray) -> NDArray:
         """Those times that may be of samples which are stored already."""
@@ -174,17 +173,19 @@ class StreamMachine(Machine[Monitor]):
         self,
         work: Work,
         state: NDArray,
-        found: Mapping[str, NDArray],
-        alarms: Sequence[Alarm],
-        endings: Sequence[Ending],
+        watched: Watched,
+        row: int,
     ) -> None:
-        """Take the state after these samples, and what was found in them."""
+        """Take the state after these samples, and what was found in them, a row of `watched`."""
+        name = self.asset.name
+        alarms = [each for each in watched.alarms if each.trajectory == name]
+        endings = [each for each in watched.endings if each.trajectory == name]
         self._state, self.changed = state, True
-        self.evidence = float(found["evidence"][-1])
-        self.outside = bool(found["outside"])
+        self.evidence = float(watched.evidence[row, -1])
+        self.outside = bool(watched.outside[row])
         places = work.first + np.arange(len(work.values))
         times = work.origin + np.round(places * self._period).astype(np.int64)
-        self.event = bool(found["event"][-1]) and not any(
+        self.event = bool(watched.event[row, -1]) and not any(
             each.sample == places[-1] for each in endings
         )
         for alarm in alarms:
@@ -193,17 +194,17 @@ class StreamMachine(Machine[Monitor]):
                 self.alarms += 1
                 self.last_alarm = moment
             data = {name: getattr(alarm, name) for name in ALARM}
-            event = self._moment(work, alarm.event)
+            event = self._moment(alarm.event, work)
             self.log("alarm" if alarm.promised else "remark", moment, **data, event=event)
         for ending in endings:
-            moment, event = (self._moment(work, each) for each in (ending.sample, ending.event))
+            moment, event = (self._moment(each, work) for each in (ending.sample, ending.event))
             self.log("end", moment, event=event, how=ending.how)
-        void = found["void"]
+        void = watched.void[row]
         if void.any() and not self.void:
             self.log("void", int(times[int(np.argmax(void))]))
         self.void = bool(void[-1])
         commands, measured = np.split(work.values, [self._commands], axis=1)
-        predicted = (found["mean"], found["deviation"], found["evidence"])
+        predicted = (watched.mean[row], watched.deviation[row], watched.evidence[row])
         self._recent.append((times, commands, measured, *predicted))
         self._kept += len(times)
         while self._kept - len(self._recent[0][0]) >= KEPT:
@@ -260,9 +261,11 @@ class StreamMachine(Machine[Monitor]):
         self._doubtful = np.array(more[3:] or self._doubtful)  # states of before have no limits
         return True
 
-    def _moment(self, work: Work, place: int) -> int:
-        """The time of a place of the stream of some work, in nanoseconds."""
-        return work.origin + round(place * self._period)
+    def _moment(self, place: float, work: Work | None = None) -> int:
+        """The time of a place of the stream, or of that of some work, in nanoseconds."""
+        origin = work.origin if work else self._origin
+        assert origin is not None
+        return origin + round(place * self._period)
 
     def _place(self, moment: int) -> int:
         assert self._origin is not None
@@ -342,9 +345,7 @@ class StreamMachine(Machine[Monitor]):
             text = f"{self._limits.names[channel]} is within its limits again"
             if outside[channel]:
                 text = f"impossible: {self._limits.text(channel, row[channel])}; it is not used"
-            assert self._origin is not None
-            moment = self._origin + round(place * self._period)
-            self.log("event", moment, what="impossible", text=text)
+            self.log("event", self._moment(place), what="impossible", text=text)
         return self._limits.kept(row)
 
     def _complete(self) -> None:
@@ -368,10 +369,8 @@ class StreamMachine(Machine[Monitor]):
         self._wrong = self._window if wrong else [0, 0, 0]
         self._window = [0, 0, 0]
         if wrong != bool(before):
-            assert self._origin is not None
-            moment = self._origin + round(place * self._period)
-            how = self.rate or "the right rate again"
-            self.log("event", moment, what="rate", text=f"samples come at {how}")
+            text = f"samples come at {self.rate or 'the right rate again'}"
+            self.log("event", self._moment(place), what="rate", text=text)
 
 
 def step(together: Sequence[tuple[StreamMachine, Work]]) -> dict[str, int]:
@@ -386,14 +385,5 @@ def step(together: Sequence[tuple[StreamMachine, Work]]) -> dict[str, int]:
     after, watched = monitor.step(before, commands, measured, names)
     states = layout.rows(after)
     for i, (machine, work) in enumerate(together):
-        alarms = [each for each in watched.alarms if each.trajectory == names[i]]
-        endings = [each for each in watched.endings if each.trajectory == names[i]]
-        machine.stepped(work, states[i], _row(watched, i), alarms, endings)
+        machine.stepped(work, states[i], watched, i)
     return {name: sum(each.trajectory == name for each in watched.events) for name in names}
-
-
-def _row(watched: Watched, i: int) -> dict[str, NDArray]:
-    return {
-        name: getattr(watched, name)[i]
-        for name in ("mean", "deviation", "evidence", "event", "void", "outside")
-    }

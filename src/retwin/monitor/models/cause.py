@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from retwin.checks import require, whole
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -35,12 +36,14 @@ PROBABLE = 0.5
 BEFORE = 100
 """Samples before an alarm from which its cause is inferred."""
 MIN_WINDOW = 10
-"""A window begins after the newest earlier alarm that leaves it more samples than this."""
+"""A cause is inferred from more samples than this."""
 OFFSET = 3.0
 """Largest offset of a sensor, in ranges of its output in calibration: a level that leaves its range
 would else be taken for a frozen sensor."""
 EVENT = 500
 """Samples of an event that are looked at, at most, to tell whether a second fault began in it."""
+GROWTH = 0.25
+"""Share of its age by which an event is older when its cause is inferred again."""
 
 PARTS = ("value", "low", "high")
 """Of an estimate."""
@@ -69,6 +72,8 @@ class Cause:
     same : bool
         Whether its event has a cause already, which explains this alarm too; else it is the first
         one of the event, or a further one.
+    unit : str
+        Of the size; "" where it has none.
 
     """
 
@@ -80,6 +85,7 @@ class Cause:
     onset: tuple[float, float, float]
     probabilities: dict[str, float]
     same: bool = False
+    unit: str = ""
 
 
 def cause_title(name: str) -> str:
@@ -91,6 +97,19 @@ def cause_text(name: str, since: str, unknown: float) -> str:
     """A cause with its onset, "" where that is not known, and whether there is more to it."""
     more = ", and more than that" if since and unknown > PROBABLE else ""
     return f"{cause_title(name)}{f' from {since}' if since else ''}{more}"
+
+
+def size_unit(fault: Fault | None, twin: DynamicsTwin) -> str:
+    """The unit of a fault's size; "" where it has none."""
+    if isinstance(fault, ParameterFault):
+        parameters = twin.equations.parameters
+        own = [each.unit for each in parameters if each.name == fault.parameter]
+        return f"{own[0]}{' per second' * fault.grows}" if own else ""
+    if isinstance(fault, ActuatorGain):
+        return "of the command"
+    if isinstance(fault, SensorDrift):
+        return f"{twin.outputs.units[fault.output]}/s"
+    return twin.outputs.units[fault.output] if isinstance(fault, SensorBias) else ""
 
 
 def cause_data(
@@ -184,6 +203,9 @@ def find_causes(
 ) -> list[Cause]:
     """The causes of alarms, from the samples before each up to it.
 
+    The cause of an event is inferred at its first alarm, and again each time that the event is a
+    quarter older (`is_due`). Other alarms of it have the cause that was inferred last.
+
     Parameters
     ----------
     twin : DynamicsTwin
@@ -196,8 +218,8 @@ def find_causes(
         Classes, None for the healthy one. Their sizes count; a fault may begin at any sample before
         the alarm and lasts until it.
     before : int
-        Number of samples before an alarm from which its cause is inferred. They begin after the
-        newest alarm before it that leaves more than ten samples, if that is later.
+        Number of samples before the first alarm of an event from which its cause is inferred. They
+        begin after the last alarm of the event before it, if that is later.
     known_start : bool
         Whether the record starts as those in calibration do; a stream may start anywhere.
 
@@ -208,8 +230,9 @@ def find_causes(
 
     """
     whole("before", before, at_least=MIN_WINDOW)
-    ids, found, known = record.ids.tolist(), [], dict[str, list[Alarm]]()
-    current = dict[tuple[str, int], str]()
+    ids, found = record.ids.tolist(), list[Cause]()
+    newest, inferred = dict[str, Alarm](), dict[tuple[str, int], list[Alarm]]()
+    current, latest = dict[tuple[str, int], str](), dict[tuple[str, int], Cause]()
     for alarm in alarms:
         require(
             alarm.trajectory in ids and alarm.sample < record.steps,
@@ -219,21 +242,45 @@ def find_causes(
             remedy="give the record that was watched",
         )
         event = alarm.trajectory, alarm.event
-        until = known.setdefault(alarm.trajectory, [])
-        until.append(alarm)
-        cause = find_cause(
-            twin,
-            record[[ids.index(alarm.trajectory)]],
-            until,
-            faults,
-            before,
-            current=current.get(event, ""),
-            known_start=known_start,
-        )
-        if not cause.same:
-            current[event] = cause.name
-        found.append(cause)
+        earlier = [newest[alarm.trajectory]] if alarm.trajectory in newest else []
+        known = inferred.setdefault(event, earlier)
+        newest[alarm.trajectory] = alarm
+        if is_due([each.sample for each in known if each.event == alarm.event], alarm.sample):
+            known.append(alarm)
+            latest[event] = find_cause(
+                twin,
+                record[[ids.index(alarm.trajectory)]],
+                known,
+                faults,
+                before,
+                current=current.get(event, ""),
+                known_start=known_start,
+            )
+            if not latest[event].same:
+                current[event] = latest[event].name
+            found.append(latest[event])
+        else:
+            found.append(replace(latest[event], alarm=alarm, same=True))
     return found
+
+
+def is_due(inferred: Sequence[int], sample: int) -> bool:
+    """Whether the cause of an event is inferred at an alarm.
+
+    The evidence for a cause grows with the samples since the event began, so that it can turn only
+    when these have become more by some share of them.
+
+    Parameters
+    ----------
+    inferred : sequence of int
+        Samples of the alarms of the event at which it was inferred; the first one is its first.
+    sample : int
+        That of the alarm.
+
+    """
+    if not inferred:
+        return True
+    return sample - inferred[-1] > max(MIN_WINDOW, GROWTH * (inferred[-1] - inferred[0]))
 
 
 def find_cause(
@@ -248,25 +295,61 @@ def find_cause(
 ) -> Cause:
     """The cause of the last of a trajectory's alarms, see `find_causes`.
 
-    A further alarm of an event is of the `same` fault, and of no second one, unless another class
-    is probable for what came after an earlier alarm of the event, and both faults together have
-    more evidence than the first one alone, which lasts or has ended.
+    A further alarm of an event is of the `same` fault unless another class is probable, for all of
+    the event or else for what came last, and explains it better: in place of the first fault, or
+    after it. That one alone may last or have ended.
 
     Parameters
     ----------
+    alarms : sequence of Alarm
+        The newest one before the event, if any, and those of the event at which its cause is
+        inferred.
     current : str
         The cause that the event has; "" for none.
 
     """
-    alarm = alarms[-1]
-    earlier = [each for each in alarms[:-1] if alarm.sample - each.sample > MIN_WINDOW]
-    last = earlier[-1].sample if earlier else -1
-    first = max(0, alarm.sample - before, last + 1)
-    begin, window = first / record.rate, _window(record, first, alarm.sample)
-    latest = (alarm.sample - first) / record.rate
+    alarm, own = alarms[-1], [each for each in alarms if each.event == alarms[-1].event]
+    opening = own[0].sample
+    first = opening - before
+    if len(own) < len(alarms):
+        first = max(first, min(alarms[0].sample + 1, opening - MIN_WINDOW))
+
+    def inferred(begin: int) -> Cause:
+        return _inferred(twin, record, begin, alarm, faults, known_start and begin == 0)
+
+    def likely(cause: Cause) -> bool:
+        return cause.probability * (1 - cause.unknown) > PROBABLE
+
+    start = max(0, first)
+    if len(own) == 1:
+        return inferred(start)
+    whole = inferred(start) if alarm.sample - opening <= before else None
+    begin = max(0, own[-2].sample + 1, alarm.sample - before)
+    cause = whole if whole is not None and likely(whole) else inferred(begin)
+    same = cause.name in (current, HEALTHY) or not likely(cause)
+    known = faults.get(current)
+    if not same and isinstance(known, TimedFault):
+        both = known, faults[cause.name]
+        window = max(start, alarm.sample - EVENT), begin, alarm
+        same = not _better(twin, record, window, both, np.log(alarm.evidence), whole is not None)
+    if whole is not None and same:
+        cause = whole
+    return replace(cause, same=same)
+
+
+def _inferred(
+    twin: DynamicsTwin,
+    record: Trajectories,
+    first: int,
+    alarm: Alarm,
+    faults: Mapping[str, Fault | None],
+    known_start: bool,
+) -> Cause:
+    """The cause of an alarm from the samples since the first one."""
+    begin, latest = first / record.rate, (alarm.sample - first) / record.rate
     lasting = {name: _lasting(fault, latest) for name, fault in faults.items()}
     made = StateInversionDiagnoser(moved(twin, alarm.machine), lasting).diagnose(
-        window, known_start=known_start and first == 0
+        _window(record, first, alarm.sample), known_start=known_start
     )
     best = int(made.probabilities[0].argmax())
 
@@ -275,7 +358,7 @@ def find_cause(
         return float(value), float(low), float(high)
 
     onset = interval(made.onset)
-    cause = Cause(
+    return Cause(
         alarm,
         made.classes[best],
         float(made.probabilities[0, best]),
@@ -283,41 +366,44 @@ def find_cause(
         interval(made.size),
         (begin + onset[0], begin + onset[1], begin + onset[2]),
         dict(zip(made.classes, made.probabilities[0].tolist(), strict=True)),
+        unit=size_unit(faults[made.classes[best]], twin),
     )
-    if alarm.event not in [each.event for each in alarms[:-1]]:
-        return cause
-    likely = cause.probability * (1 - cause.unknown) > PROBABLE
-    same = cause.name in (current, HEALTHY) or not likely
-    known, own = faults.get(current), [each for each in earlier if each.event == alarm.event]
-    if not same and isinstance(known, TimedFault):
-        both = known, faults[cause.name]
-        # Without an earlier alarm that leaves a window, the first fault's onset is in this one.
-        same = not own or not _second(twin, record, [*own, alarm], both, np.log(len(faults)))
-    return replace(cause, same=same)
 
 
-def _second(
+def _better(
     twin: DynamicsTwin,
     record: Trajectories,
-    alarms: Sequence[Alarm],
+    window: tuple[int, int, Alarm],
     faults: tuple[TimedFault, Fault | None],
     penalty: float,
+    whole: bool,
 ) -> bool:
-    """Whether a second fault began after the last alarm but one of an event.
+    """Whether another fault explains an event better than its cause alone.
 
-    Compared is the evidence in the same samples. After that alarm the states are unknown again if
-    there is a second fault; the first one, if it has ended, had its most probable size and onset.
+    Compared is the evidence in the same samples. The cause lasts or has ended, where it had its
+    most probable size and onset. The other fault is a second one in the samples before the alarm,
+    or is there in place of the cause. Where the second one begins the states may be unknown again,
+    and if there is none also the size of the first one.
+
+    Parameters
+    ----------
+    window : tuple of int, int and Alarm
+        The first sample that counts, the first of those with a second fault, and the alarm.
+    faults : tuple of TimedFault and Fault
+        The cause and the other one.
+    penalty : float
+        By which the evidence for two faults must be larger: as for an alarm.
+    whole : bool
+        Whether these are all samples of the event: only then the cause may be another one.
+
     """
-    opening, previous, last = alarms[0], alarms[-2].sample, alarms[-1].sample
-    first = max(0, opening.sample - BEFORE, last - EVENT)
-    if previous - first < MIN_WINDOW:
-        return True
-    healthy = moved(twin, opening.machine)
+    (first, begin, alarm), last = window, window[2].sample
+    if begin - first < MIN_WINDOW:
+        return whole
+    healthy = moved(twin, alarm.machine)
 
-    def evidence(
-        begin: int, end: int, fault: Fault | None, of: DynamicsTwin = healthy
-    ) -> tuple[float, NDArray]:
-        model = FaultEvidence.of(of, _window(record, begin, end), known_start=False)
+    def evidence(begin: int, end: int, fault: Fault | None) -> tuple[float, NDArray]:
+        model = FaultEvidence.of(healthy, _window(record, begin, end), known_start=False)
         known = fault if isinstance(fault, TimedFault) else None
         found = model.integral(known)
         return model.tolerated(known, found).evidence, found.best
@@ -326,17 +412,21 @@ def _second(
         return _lasting(fault, (end - begin) / record.rate)
 
     one, other = faults
-    until, (size, onset, _) = evidence(first, previous, lasts(first, previous, one))
+    until, (size, onset, _) = evidence(first, begin - 1, lasts(first, begin - 1, one))
     onset, after = onset / record.rate, (last + 1 - first) / record.rate
     point = replace(one, onset=onset, end=None)
     if isinstance(point, SizedFault):
         point = replace(point, size=float(size))
     end = replace(point, end=(onset + 1 / record.rate, after))
-    ended = until + evidence(first, last, end)[0] - evidence(first, previous, point)[0]
-    whole_event = evidence(first, last, lasts(first, last, one))[0]
-    begun = lasts(previous + 1, last, other)
-    again = evidence(previous + 1, last, begun, moved(twin, alarms[-1].machine))[0]
-    return bool(until + again - penalty > np.logaddexp(whole_event, ended))
+    alone = (
+        evidence(first, last, lasts(first, last, one))[0],
+        until + evidence(first, last, end)[0] - evidence(first, begin - 1, point)[0],
+        until + evidence(begin, last, replace(one, onset=0.0, end=None))[0],
+    )
+    more = [until + evidence(begin, last, lasts(begin, last, other))[0] - penalty]
+    if whole:
+        more.append(evidence(first, last, lasts(first, last, other))[0])
+    return bool(logsumexp(more) > logsumexp(alone))
 
 
 def _lasting(fault: Fault | None, latest: float) -> Fault | None:

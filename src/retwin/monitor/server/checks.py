@@ -10,7 +10,6 @@ from retwin.monitor.models.kinds import AnyMonitor
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
     ParameterDrift,
-    ParameterFault,
     ParameterShift,
     SensorBias,
     SensorDrift,
@@ -61,20 +60,6 @@ def what_to_check(name: str, fault: object, monitor: AnyMonitor) -> str:
         return NOTHING
     found = SENTENCES.get(type(fault))
     return found(fault, monitor) if found else UNNAMED
-
-
-def size_unit(fault: object, monitor: AnyMonitor) -> str:
-    """The unit of a fault's size; "" where it has none."""
-    units = monitor.twin.outputs.units
-    if isinstance(fault, ParameterFault):
-        parameters = monitor.twin.equations.parameters
-        own = [each.unit for each in parameters if each.name == fault.parameter]
-        return f"{own[0]}{' per second' * fault.grows}" if own else ""
-    if isinstance(fault, ActuatorGain):
-        return "of the command"
-    if isinstance(fault, SensorDrift):
-        return f"{units[fault.output]}/s"
-    return units[fault.output] if isinstance(fault, SensorBias) else ""
 
 
 def _input(fault: ActuatorGain, monitor: AnyMonitor) -> str:

@@ -91,7 +91,7 @@ class Journal:
         of = data.get("alarm", -1)
         alarm = self._alarms.get(self._opened.get(of, of))
         if alarm is not None and entry.kind == "cause":
-            if not data.get("same"):
+            if not data.get("same") or _refines(data, alarm):
                 alarm["cause"] = dict(data)
         elif entry.kind == "end":
             event = self._event.pop(data["asset"], None)
@@ -126,3 +126,11 @@ class Journal:
             if entry.kind == "void":
                 self._void[data["asset"]] = made["time"]
             self._events.setdefault(data["asset"], deque(maxlen=EVENTS)).append(made)
+
+
+def _refines(data: Mapping[str, Any], alarm: Mapping[str, Any]) -> bool:
+    """Whether a cause is the one that opened the event of an alarm, from more samples."""
+    if alarm["cause"] is None or data["name"] != alarm["cause"]["name"]:
+        return False
+    onset = data["onset"][0]
+    return onset is not None and bool(onset / SECOND <= alarm["time"])

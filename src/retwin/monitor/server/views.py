@@ -17,11 +17,11 @@ from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.live import Live
 from retwin.monitor.live.machine import Recent
 from retwin.monitor.live.status import AssetStatus
-from retwin.monitor.models.cause import possible_causes
+from retwin.monitor.models.cause import possible_causes, size_unit
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor, pace
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.trajectories import TrajectoryMonitor
-from retwin.monitor.server.checks import size_unit, what_to_check
+from retwin.monitor.server.checks import what_to_check
 from retwin.monitor.server.journal import Journal
 from retwin.monitor.store.gridded import gridded
 from retwin.monitor.store.samples import SECOND
@@ -200,7 +200,7 @@ class Views:
             cause = dict(alarm["cause"])
             fault = self._causes(twin, alarm["version"]).get(cause["name"])
             cause["onset"] = [None if each is None else each / SECOND for each in cause["onset"]]
-            cause["unit"] = "" if cause["size"][0] is None else size_unit(fault, monitor)
+            cause["unit"] = "" if cause["size"][0] is None else size_unit(fault, monitor.twin)
             cause["check"] = what_to_check(cause["name"], fault, monitor)
             made["cause"] = cause
         return made

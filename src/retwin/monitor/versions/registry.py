@@ -154,13 +154,11 @@ class Registry:
 
     def shadow(self, number: int) -> Version:
         """Let a proposed version predict beside the active one, without alarms that count."""
-        with self._store.lock:
-            return self._step("shadow", number)
+        return self._step("shadow", number)
 
     def reject(self, number: int, reason: str) -> Version:
         """Give up a version that is proposed or a shadow."""
-        with self._store.lock:
-            return self._step("reject", number, reason=reason)
+        return self._step("reject", number, reason=reason)
 
     def promote(self, number: int, evidence: Decision | None = None) -> Version:
         """Make a version the active one; the former one is retired.
@@ -237,19 +235,20 @@ class Registry:
         return given("version", found, known, got=number, remedy="propose it first")
 
     def _step(self, step: str, number: int, *, first: bool = False, **more: Any) -> Version:
-        version = self._version(number)
-        allowed = BEFORE[step] + (("proposed",) if first else ())
-        require(
-            version.state in allowed,
-            f"version {number}",
-            expected=f"one that is {' or '.join(allowed)}, to {step} it",
-            got=f"one that is {version.state}",
-            remedy="see versions()",
-        )
-        if AFTER[step] != "rejected":
-            self.folder(number)
-        self._log(step, number, **more)
-        return self._version(number)
+        with self._store.lock:
+            version = self._version(number)
+            allowed = BEFORE[step] + (("proposed",) if first else ())
+            require(
+                version.state in allowed,
+                f"version {number}",
+                expected=f"one that is {' or '.join(allowed)}, to {step} it",
+                got=f"one that is {version.state}",
+                remedy="see versions()",
+            )
+            if AFTER[step] != "rejected":
+                self.folder(number)
+            self._log(step, number, **more)
+            return self._version(number)
 
     def _log(self, step: str, number: int, **more: Any) -> None:
         data = {"twin": self.twin, "step": step, "version": number, **more}

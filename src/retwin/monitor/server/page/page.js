@@ -338,8 +338,8 @@
         facts(["Evidence for a change", now.evidence ? `${percent(now.evidence)} of the threshold` : "none", `alarm from ${digits(held.arl)} on`],
           ["Newest sample", stamp(now.time), Object.entries(now.counts).filter(([, n]) => n).map(([k, n]) => `${n} ${k}`).join(", ")],
           ["Twin", h("a", { href: to("versions", now.twin) }, now.twin), `version ${now.version}`],
-          ["False events, promised", `1 in ${span(held.run_length / held.rate)}`, "under the model, on average, at most"],
-          ...(held.tried ? [["False events, tried", `${held.tried.events} in ${span(held.tried.samples / held.rate)}`, `records left out in turn: at most 1 in ${span(held.tried.run_length / held.rate)} (exact 95 % bound)`]] : [])));
+          ["False events, promised", `1 in ${span(held.run_length / held.rate)}`, "at most, on average, by the model of the noise"],
+          ...(held.tried ? [["False events, tried", `${held.tried.events} in ${span(held.tried.samples / held.rate)}`, `records left out in turn, which alone bounds the rate at 1 in ${span(held.tried.run_length / held.rate)} (exact 95 %)`]] : [])));
       if (draw) draw(held);
       const text = JSON.stringify(held.events);
       if (text !== shown && !log.contains(document.activeElement)) {
