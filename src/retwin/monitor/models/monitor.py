@@ -247,11 +247,11 @@ class Monitor:
         counted = np.isfinite(low).reshape(count, len(self.slack), -1).any(axis=1)
         rules = self.rules
         alarm = rules.alarms(total)
-        over = np.repeat(state.course.over[:, None], samples, axis=1)
+        over = np.ones(total.shape)
         if not learn.all():
             change = state.course.change + [[len(self.slack), 0]] * np.arange(count)[:, None]
             given = state.course.over, change, state.detector.previous
-            over = streams.detector.over(*given, low, high)
+            over = np.where(learn[:, None], over, streams.detector.over(*given, low, high))
         ended = rules.ends(state.course, total, over, counted) & ~alarm
         outside = self._outside(commands)
         changed = rules.changes(state.course, samples) & ~ended
