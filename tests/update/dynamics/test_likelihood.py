@@ -10,8 +10,9 @@ import torch
 
 import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
-from retwin.update.dynamics import DynamicsTwin, likelihood
+from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.discrepancy.domain import Domain
+from retwin.update.dynamics.filter import likelihood
 from retwin.update.dynamics.filter.likelihood import Record, Variants
 
 SAMPLES, COUNT = 60, 11

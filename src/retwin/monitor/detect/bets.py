@@ -25,9 +25,9 @@ CLIP = 4.0
 probability beyond the clip matters, which may be 6e-5 at κ = 1 and 0.0014 at κ = 1.25."""
 PER_UNIT = 64
 """Cells of the grid of scores per standard deviation."""
-LEVELS = np.linspace(-CLIP, CLIP, 17)
+LEVELS = np.linspace(-3.0, 3.0, 13)
 """Values to which the score before is rounded, on which bets on dependence and repetition depend:
-halves, which are as narrow as a repetition."""
+halves, which are as narrow as a repetition. Beyond them, dependence would be as good as a shift."""
 FLOOR = 1e-6
 """Least value of a bet before its division: a product never becomes 0."""
 EDGES = np.concatenate(
