@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from retwin.report.png import blank, dress
-from retwin.report.style import PALETTE, hexadecimal
+from retwin.report.figures.png import blank, dress
+from retwin.report.figures.style import PALETTE, hexadecimal
 
 __all__ = [
     "BLUE",

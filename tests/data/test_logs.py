@@ -21,9 +21,9 @@ import retwin as rt
 from retwin.cases.twin_data import TwinData, log_case
 from retwin.data import Provenance, load, propose_mapping, read_mapping, save
 from retwin.data import tables as text_tables
-from retwin.data.logs import arrow_tables
 from retwin.data.logs.channels import in_order
 from retwin.data.logs.cutting import pieces
+from retwin.data.logs.formats import arrow_tables
 from retwin.data.logs.mapped import mapped
 from retwin.data.logs.mapping import Cut, Mapping
 from retwin.data.logs.messages import Series, Types
@@ -33,7 +33,7 @@ from retwin.data.logs.units import compatible, converted, unit_in_name
 from retwin.data.resampling import resample
 from retwin.data.row_times import row_times
 from retwin.errors import InputError
-from retwin.report.figure import Line, envelope
+from retwin.report.figures.figure import Line, envelope
 from retwin.serialisation.sizes import Budget
 
 

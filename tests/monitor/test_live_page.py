@@ -17,7 +17,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 from served import ASSETS, LEAKING, LEVEL, STEPS, TWIN, Served, served
 
-from retwin.report.style import CHROME
+from retwin.report.figures.style import CHROME
 
 pytestmark = pytest.mark.slow
 PATIENCE = 60_000  # ms, for machines that are busy

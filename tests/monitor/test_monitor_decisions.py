@@ -22,13 +22,14 @@ from retwin.monitor.live.machine import Counts
 from retwin.monitor.live.status import AssetStatus
 from retwin.monitor.live.stream_machine import BEHIND, TOLERATED, WINDOW, StreamMachine, Work
 from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
-from retwin.monitor.models import cause, trajectories, visibility
+from retwin.monitor.models import cause, visibility
 from retwin.monitor.models.cause import MIN_WINDOW, PROBABLE, Cause, cause_text, is_due
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import BEYOND, Monitor
 from retwin.monitor.models.parts import Part
-from retwin.monitor.models.trajectories import COMPARABLE, SHOWN, TrajectoryMonitor
-from retwin.monitor.models.trajectory_evidence import Compared
+from retwin.monitor.models.trajectory import monitor as trajectories
+from retwin.monitor.models.trajectory.evidence import Compared
+from retwin.monitor.models.trajectory.monitor import COMPARABLE, SHOWN, TrajectoryMonitor
 from retwin.monitor.models.visible import SHARE, Visible
 from retwin.monitor.models.watched import Alarm, Ending
 from retwin.monitor.server import journal, views

@@ -20,7 +20,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 import retwin as rt
-from retwin.report.style import CHROME
+from retwin.report.figures.style import CHROME
 
 pytestmark = pytest.mark.slow
 PATIENCE = 120_000  # ms, for machines that are busy

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from retwin.data.quality.finding import Finding
-from retwin.report.figure import Axis, Band, Figure, Line, Matrices, Matrix, Panel, Row
-from retwin.report.plotly_specs import panel_spec
-from retwin.report.png import draw, png
+from retwin.report.figures.figure import Axis, Band, Figure, Line, Matrices, Matrix, Panel, Row
+from retwin.report.figures.plotly_specs import panel_spec
+from retwin.report.figures.png import draw, png
 from retwin.report.sections import SECTIONS, sections_of
 from retwin.report.sections.discrepancy import latents
 from retwin.report.sections.fidelity import fidelity

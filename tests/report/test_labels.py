@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from retwin.catalog import SOURCES
+from retwin.report.figures.style import CHROME, PALETTE, colour_index, dash, symbol
 from retwin.report.labels import (
     class_name,
     difference,
@@ -17,7 +18,6 @@ from retwin.report.labels import (
     signed,
     span,
 )
-from retwin.report.style import CHROME, PALETTE, colour_index, dash, symbol
 from retwin.results.sources import Comparison
 
 

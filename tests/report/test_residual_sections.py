@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from retwin.errors import InputError
-from retwin.report.figure import Band, Figure, Line, Points, Spans
+from retwin.report.figures.figure import Band, Figure, Line, Points, Spans
+from retwin.report.figures.plotly_specs import panel_spec
+from retwin.report.figures.png import draw
 from retwin.report.page import render
-from retwin.report.plotly_specs import panel_spec
-from retwin.report.png import draw
 from retwin.report.sections import sections_of
 from retwin.report.sections.delta import delta
 from retwin.report.sections.residuals import residuals

@@ -106,7 +106,7 @@ def map_log(
     from retwin.data.logs.mapped import try_mapping
     from retwin.data.logs.mapping import TimeSettings
     from retwin.data.logs.proposal import propose_mapping
-    from retwin.report.log_picture import log_picture
+    from retwin.report.figures.log_picture import log_picture
 
     ends_in("--out", out, (".toml",), remedy="give another name, such as mapping.toml")
     picture = out.with_suffix(".png")

@@ -96,7 +96,7 @@ def _write_bands(
     """Mean and quantiles of every sample of given commands, as a table and of one as a picture."""
     from retwin.evaluation import predict_records
     from retwin.report.choice.page import draw_prediction
-    from retwin.report.png import png
+    from retwin.report.figures.png import png
 
     updated, system = source_of(model, case)
     records = read_commands(commands, system, mapping=mapping)

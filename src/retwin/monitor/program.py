@@ -26,7 +26,7 @@ from retwin.monitor.live.notifications import (
 )
 from retwin.monitor.live.sentences import sentence
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
-from retwin.monitor.models.trajectories import TrajectoryMonitor
+from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.server import create_app, listening, serving
 from retwin.monitor.server.app import check_token
 from retwin.monitor.settings import (

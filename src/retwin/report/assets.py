@@ -18,9 +18,9 @@ from pydantic_core import from_json, to_json
 
 from retwin._version import __version__
 from retwin.report import labels
-from retwin.report.figure import Figure, Matrices
-from retwin.report.plotly_specs import figure_specs
-from retwin.report.style import CHROME, PALETTE, colour_of, symbol
+from retwin.report.figures.figure import Figure, Matrices
+from retwin.report.figures.plotly_specs import figure_specs
+from retwin.report.figures.style import CHROME, PALETTE, colour_of, symbol
 
 LABELS = {name: each for name, each in vars(labels).items() if isinstance(each, FunctionType)}
 """The filters of all templates, under their own names."""

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from retwin.report.figure import Figure, Matrices
+from retwin.report.figures.figure import Figure, Matrices
 
 
 @dataclass(frozen=True)

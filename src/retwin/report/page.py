@@ -13,7 +13,7 @@ from markupsafe import Markup
 from retwin.report import labels
 from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Section
-from retwin.report.figure import Figure, Matrices
+from retwin.report.figures.figure import Figure, Matrices
 from retwin.report.glossary import explained
 from retwin.report.sections import sections_of
 from retwin.report.study import Study, read_study
@@ -87,7 +87,7 @@ def write_report(folder: str | os.PathLike[str], *, figures: bool = False) -> Pa
     sections = sections_of(study)
     written: set[str] = set()
     if figures:
-        from retwin.report.png import png  # imports matplotlib, which takes a second
+        from retwin.report.figures.png import png  # imports matplotlib, which takes a second
 
         front = picture(study)
         drawn: list[Figure | Matrices] = [front] if front else []

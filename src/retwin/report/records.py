@@ -11,7 +11,7 @@ from retwin.data.quality.check import Checked
 from retwin.data.quality.finding import NAMED, Finding, group_alike
 from retwin.data.trajectories import Trajectories
 from retwin.report.blocks import Table, tabulate, text_column
-from retwin.report.figure import Figure, Key, Line, Mark, Panel, Spans, record_panel
+from retwin.report.figures.figure import Figure, Key, Line, Mark, Panel, Spans, record_panel
 
 TITLE = "What your records look like"
 """The heading on the terminal and on pages."""

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.report.blocks import Table, tabulate
-from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, bar, draw_bands
+from retwin.report.figures.figure import Axis, Figure, Key, Line, Mark, Panel, Row, bar, draw_bands
+from retwin.report.figures.style import colour_of
 from retwin.report.labels import (
     behind,
     learned_name,
@@ -25,7 +26,6 @@ from retwin.report.labels import (
     span,
 )
 from retwin.report.study import Study
-from retwin.report.style import colour_of
 from retwin.report.uses import RULE, use_rows
 from retwin.report.verdict import headline
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval

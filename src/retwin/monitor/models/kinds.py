@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.trajectories import KIND, TrajectoryMonitor
+from retwin.monitor.models.trajectory.monitor import KIND, TrajectoryMonitor
 from retwin.serialisation.models import kind_of
 
 AnyMonitor = Monitor | TrajectoryMonitor

@@ -29,7 +29,7 @@ from retwin.monitor.server.views import Views
 from retwin.monitor.store.samples import parse
 from retwin.monitor.versions.decision import Decision
 from retwin.monitor.versions.registry import Registry
-from retwin.report.style import CHROME, PALETTE
+from retwin.report.figures.style import CHROME, PALETTE
 
 if TYPE_CHECKING:
     import fastapi

@@ -20,7 +20,7 @@ from retwin.monitor.live.status import AssetStatus
 from retwin.monitor.models.cause import possible_causes, size_unit
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor, pace
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.trajectories import TrajectoryMonitor
+from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.server.checks import what_to_check
 from retwin.monitor.server.journal import Journal
 from retwin.monitor.store.gridded import gridded

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.layout import HEAD, encoding_of, text_layout
 from retwin.data.layout import Layout as TextLayout
-from retwin.data.logs.arrow_tables import read_table
 from retwin.data.logs.channels import in_unit, mean_of
+from retwin.data.logs.formats.arrow_tables import read_table
 from retwin.data.logs.mapping import ChannelMapping
 from retwin.data.logs.signals import NANOSECOND, Clock, Signal, TimeUnit, named_unit
 from retwin.data.logs.units import same_unit

@@ -15,7 +15,7 @@ from retwin.checks import require
 from retwin.data.io import load
 from retwin.errors import InputError
 from retwin.monitor.live.gate import Gate
-from retwin.monitor.models.trajectories import TrajectoryMonitor
+from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.sources.folder import Files
 from retwin.monitor.sources.layouts import layout_of
 from retwin.monitor.store.samples import LONGEST, SECOND, Trajectory, places

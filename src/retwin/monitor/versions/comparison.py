@@ -17,7 +17,7 @@ from retwin.monitor.detect.promise import FalseAlarmTest
 from retwin.monitor.models.cause import BEFORE
 from retwin.monitor.models.kinds import load_monitor
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.trajectories import TrajectoryMonitor
+from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.store.gridded import gridded, record_of
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.store.store import Store

@@ -9,9 +9,19 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.evaluation.identification.validation import Identification
-from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row, record_panel
+from retwin.report.figures.figure import (
+    Axis,
+    Figure,
+    Key,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Row,
+    record_panel,
+)
+from retwin.report.figures.residual_panels import ChannelRecords, Errors, residual_figures
 from retwin.report.labels import behind
-from retwin.report.residual_panels import ChannelRecords, Errors, residual_figures
 
 OUTPUTS, INPUTS = 6, 3
 """Outputs and inputs of which figures are drawn, at most."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from retwin.report.blocks import Section
-from retwin.report.figure import Matrices, Matrix
+from retwin.report.figures.figure import Matrices, Matrix
 from retwin.report.labels import class_name, source_name
 from retwin.report.study import Study
 from retwin.scores.classification import row_shares

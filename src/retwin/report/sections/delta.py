@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from retwin.report.blocks import Cell, Section, Table, tabulate
-from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row, Spans
+from retwin.report.figures.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row, Spans
+from retwin.report.figures.style import colour_of
 from retwin.report.labels import number, places, shown_unit, signed
 from retwin.report.study import Study
-from retwin.report.style import colour_of
 
 SOURCE = "dynamics"
 WIDTH = 1.6449

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from retwin.report.blocks import Cell, Section, Table, tabulate
-from retwin.report.figure import Axis, Figure, Key, Line, Panel, Row, bar, outline
+from retwin.report.figures.figure import Axis, Figure, Key, Line, Panel, Row, bar, outline
+from retwin.report.figures.style import colour_of
 from retwin.report.labels import (
     latent_names,
     number,
@@ -17,7 +18,6 @@ from retwin.report.labels import (
 )
 from retwin.report.sections.segment import segment, segment_figure
 from retwin.report.study import Component, Study
-from retwin.report.style import colour_of
 from retwin.results import FidelityFigure
 
 FEW = 3

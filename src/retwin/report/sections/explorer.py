@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.report.blocks import Section
-from retwin.report.figure import Key
+from retwin.report.figures.figure import Key
+from retwin.report.figures.style import DASHES, PALETTE, colour_index, colour_of
 from retwin.report.labels import class_name, quantities, source_name
 from retwin.report.study import Study
-from retwin.report.style import DASHES, PALETTE, colour_index, colour_of
 from retwin.results import OverlayInfo
 
 MISSING = 65535

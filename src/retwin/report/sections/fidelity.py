@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.report.blocks import Cell, Section, Table, grouped, tabulate
-from retwin.report.figure import (
+from retwin.report.figures.figure import (
     Axis,
     Band,
     Figure,
@@ -21,10 +21,10 @@ from retwin.report.figure import (
     draw_bands,
     outline,
 )
+from retwin.report.figures.style import colour_of
 from retwin.report.labels import number, order, places, quantities, source_name, span, with_unit
 from retwin.report.sections.discrepancy import detailed, figure_cell, suffixes, titled
 from retwin.report.study import Study
-from retwin.report.style import colour_of
 from retwin.results import FidelityFigure, FidelityResults
 
 RIVALS = {"mean_only": "Mean only", "single_gaussian": "One Gaussian"}

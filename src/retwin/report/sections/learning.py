@@ -7,10 +7,10 @@ from typing import Any
 
 from retwin.catalog import METRICS
 from retwin.report.blocks import Section
-from retwin.report.figure import Axis, Figure, Key, Panel, Points, Row
+from retwin.report.figures.figure import Axis, Figure, Key, Panel, Points, Row
+from retwin.report.figures.style import colour_index, colour_of, dash, symbol
 from retwin.report.labels import in_sentence, metric_name, metric_quantity, order, source_name
 from retwin.report.study import Study
-from retwin.report.style import colour_index, colour_of, dash, symbol
 from retwin.results.sources import CurvePoint
 
 Curves = dict[str, list[CurvePoint]]

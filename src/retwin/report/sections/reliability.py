@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from retwin.report.blocks import Section
-from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row
+from retwin.report.figures.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row
+from retwin.report.figures.style import colour_of, symbol
 from retwin.report.labels import source_name
 from retwin.report.sections.roc import selected
 from retwin.report.study import Study
-from retwin.report.style import colour_of, symbol
 from retwin.scores import calibration
 
 

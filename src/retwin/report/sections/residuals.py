@@ -9,11 +9,17 @@ from numpy.typing import NDArray
 
 from retwin.arrays import runs
 from retwin.report.blocks import Cell, Section, Table, tabulate
-from retwin.report.figure import Axis, Figure, Key, Mark, Panel, Points, Row, Spans
+from retwin.report.figures.figure import Axis, Figure, Key, Mark, Panel, Points, Row, Spans
+from retwin.report.figures.residual_panels import (
+    ChannelRecords,
+    Errors,
+    line,
+    log_axis,
+    residual_figures,
+)
+from retwin.report.figures.style import colour_of, dash
 from retwin.report.labels import decimals, number, p_value, quantity, source_name, with_unit
-from retwin.report.residual_panels import ChannelRecords, Errors, line, log_axis, residual_figures
 from retwin.report.study import Study
-from retwin.report.style import colour_of, dash
 from retwin.scores.residuals import (
     Correlogram,
     autocorrelation,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 from retwin.report.blocks import Section
-from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
+from retwin.report.figures.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
+from retwin.report.figures.style import colour_of, dash
 from retwin.report.labels import MANY, mean_and_deviation, order, source_name, with_role
 from retwin.report.study import Study
-from retwin.report.style import colour_of, dash
 from retwin.scores.roc import micro_roc
 
 

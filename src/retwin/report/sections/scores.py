@@ -9,7 +9,8 @@ import numpy as np
 
 from retwin.catalog import METRICS
 from retwin.report.blocks import Cell, Column, Section, Table, tabulate
-from retwin.report.figure import Axis, Figure, Heading, Key, Mark, Panel, Points, Row
+from retwin.report.figures.figure import Axis, Figure, Heading, Key, Mark, Panel, Points, Row
+from retwin.report.figures.style import colour_of, symbol
 from retwin.report.labels import (
     MAIN,
     MANY,
@@ -25,7 +26,6 @@ from retwin.report.labels import (
     with_unit,
 )
 from retwin.report.study import Study
-from retwin.report.style import colour_of, symbol
 from retwin.results import Results
 from retwin.results.sources import SourceResults
 

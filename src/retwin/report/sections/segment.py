@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.report.figure import Axis, Dimension, Figure, Key, Line, Mark, Panel, Row, Spans
+from retwin.report.figures.figure import Axis, Dimension, Figure, Key, Line, Mark, Panel, Row, Spans
 from retwin.report.labels import number
 from retwin.report.study import Study
 from retwin.scores.segments import SegmentError, clearest_segment, median_error_trajectory

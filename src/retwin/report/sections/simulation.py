@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from retwin.report.blocks import Section
-from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, draw_bands
+from retwin.report.figures.figure import Axis, Figure, Key, Line, Mark, Panel, Row, draw_bands
+from retwin.report.figures.style import colour_of, dash
 from retwin.report.labels import quantity, source_name
 from retwin.report.study import Study
-from retwin.report.style import colour_of, dash
 
 SHOWN = 2
 """Records that the figure shows, at most."""

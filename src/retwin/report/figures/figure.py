@@ -1,6 +1,6 @@
 """What a figure shows: arrays, labels and units, prepared once for the page and for the PNG.
 
-Colours are names: `c0` to `c7` of the palette, or those of `retwin.report.style.CHROME`.
+Colours are names: `c0` to `c7` of the palette, or those of `retwin.report.figures.style.CHROME`.
 """
 
 from __future__ import annotations

@@ -7,9 +7,9 @@ import numpy as np
 from retwin.arrays import runs
 from retwin.data.logs.mapped import Parts
 from retwin.data.logs.signals import Log
-from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Row, Spans
+from retwin.report.figures.figure import Axis, Figure, Key, Line, Mark, Panel, Row, Spans
+from retwin.report.figures.png import png
 from retwin.report.labels import counted
-from retwin.report.png import png
 
 MAX_ROWS = 16
 """Signals that are drawn at most."""

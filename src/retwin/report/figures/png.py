@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator, PercentFormatter
 from PIL import Image
 
-from retwin.report.figure import (
+from retwin.report.figures.figure import (
     Axis,
     Band,
     Dimension,
@@ -32,7 +32,7 @@ from retwin.report.figure import (
     Row,
     Spans,
 )
-from retwin.report.style import CHROME, DASHES, colour_of, hexadecimal
+from retwin.report.figures.style import CHROME, DASHES, colour_of, hexadecimal
 
 STYLES: dict[str, Any] = dict(zip(DASHES, ("-", "--", ":", "-."), strict=True))
 SYMBOLS = {"circle": "o", "square": "s", "diamond": "D", "diamond-open": "D"}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from retwin.report.figure import (
+from retwin.report.figures.figure import (
     Axis,
     Band,
     Dimension,

@@ -26,7 +26,7 @@ from retwin.monitor.detect.promise import MAX_RUN_LENGTH, MIN_RUN_LENGTH, durati
 from retwin.monitor.detect.scores import ConformalScores, middle
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.detect.validity import Validity
-from retwin.monitor.models.trajectory_evidence import (
+from retwin.monitor.models.trajectory.evidence import (
     LARGEST_RATIO,
     Compared,
     Inversion,
@@ -36,8 +36,8 @@ from retwin.monitor.models.trajectory_evidence import (
     factors,
     twin_of,
 )
-from retwin.monitor.models.trajectory_state import TrajectoryState
-from retwin.monitor.models.watched_trajectories import TrajectoryAlarm, WatchedTrajectories
+from retwin.monitor.models.trajectory.state import TrajectoryState
+from retwin.monitor.models.trajectory.watched import TrajectoryAlarm, WatchedTrajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import check_weights, read_model, refusing, write_model
 

@@ -12,14 +12,14 @@ from retwin.errors import InputError
 from retwin.monitor.detect.offsets import biases, fit_offsets
 from retwin.monitor.detect.promise import false_alarms
 from retwin.monitor.detect.scores import fit_scores
-from retwin.monitor.models.trajectories import TrajectoryMonitor
-from retwin.monitor.models.trajectory_evidence import (
+from retwin.monitor.models.trajectory.evidence import (
     Inversion,
     alternatives,
     checked,
     compared,
     factors,
 )
+from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.update.dynamics.filter.noise import CERTAIN

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
+from retwin.report.figures.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
 from retwin.scores.residuals import autocorrelation, cross_correlation, decorrelated_after, spectra
 
 POINTS = 241

@@ -1,0 +1,1 @@
+"""One file per format of logs: its signals, as they were recorded."""

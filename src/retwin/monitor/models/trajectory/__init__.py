@@ -1,0 +1,1 @@
+"""The monitor of machines that work in trajectories: calibration, state, evidence."""

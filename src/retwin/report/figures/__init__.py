@@ -1,0 +1,1 @@
+"""A figure as values, and what draws it: plotly for pages, matplotlib for files."""
