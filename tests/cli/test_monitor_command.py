@@ -40,6 +40,11 @@ def test_a_cause_is_written_with_its_time_size_and_probability_where_it_has_them
     assert _written(none) == "no known fault; probability 0.70"
     leaking = Cause(alarm, "leaking", 0.7, 0.0, (0.2, 0.1, 0.3), (2.0, 1.0, 3.0), named, unit="1/s")
     assert _written(leaking) == "leaking from 2 s; size 0.2 1/s (0.1 to 0.3), probability 0.70"
+    more = replace(leaking, unknown=0.9, unit="1")
+    assert _written(more) == (
+        "leaking from 2 s, and more than that; size 0.2 (0.1 to 0.3), "
+        "probability 0.70 among the known causes"
+    )
     frozen = replace(leaking, size=nothing, unit="")
     assert _written(frozen) == "leaking from 2 s; probability 0.70"
 
@@ -76,7 +81,7 @@ def test_a_leak_is_reported_with_its_time_and_cause(watched: Path, call) -> None
     assert "healthy.npz: 0 events in 0.111 measured hours." in printed
     assert "leaking from" in printed
     words = " ".join(printed.split())
-    assert "This replay of 13.3 minutes shows 1 events; if all was healthy, that alone" in words
+    assert "This replay of 13.3 minutes shows 1 event; if all was healthy, that alone" in words
     assert "(exact 95 %). The promise of at most one false event in" in words
     assert "probability 1.00" in words
     assert first["cause"]["unit"] == "1/s"

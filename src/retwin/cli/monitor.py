@@ -41,7 +41,7 @@ from retwin.cli.reading import (
 )
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.quality.check import check_records
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
 
@@ -411,14 +411,16 @@ def _causes(
 
 def _written(cause: Cause) -> str:
     """A cause with its onset, size and probability, and whether there is more to it."""
-    from retwin.monitor.models.cause import cause_text
+    from retwin.monitor.models.cause import PROBABLE, cause_text
 
     since = "" if isnan(cause.onset[0]) else f"{cause.onset[0]:.6g} s"
     value, low, high = cause.size
-    of = f" {cause.unit}" if cause.unit else ""
+    of = f" {cause.unit}" if cause.unit not in ("", "1") else ""
     size = "" if isnan(value) else f"size {value:.3g}{of} ({low:.3g} to {high:.3g}), "
     text = cause_text(cause.name, since, cause.unknown)
-    return f"{text}; {size}probability {cause.probability:.2f}"
+    more = cause.unknown > PROBABLE and cause.name != HEALTHY
+    among = " among the known causes" if more else ""
+    return f"{text}; {size}probability {cause.probability:.2f}{among}"
 
 
 def _event_rows(
@@ -446,13 +448,15 @@ def _event_rows(
 
 def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
     """What was watched, and whether the promise applied."""
+    from retwin.report.labels import counted
+
     seconds = record.mask.any(axis=2).sum() / record.rate
     void = [float(each.argmax()) / record.rate for each in watched.void if each[-1]]
     events = sum(each.promised for each in watched.events)
-    text = f"{file.name}: {events} events in {seconds / 3600:.3g} measured hours"
+    text = f"{file.name}: {counted(events, 'event')} in {seconds / 3600:.3g} measured hours"
     remarks = len(watched.events) - events
     if remarks:
-        text += f", and {remarks} remarks where nothing is promised"
+        text += f", and {counted(remarks, 'remark')} where nothing is promised"
     if void:
         text += (
             f"; in {len(void)} of {len(record)} records the promise is VOID, since {min(void):.6g} "
@@ -475,14 +479,15 @@ def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
 def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> str:
     """What a replay shows of the rate of false events, with its exact bound, and the promise."""
     from retwin.monitor.detect.promise import duration, shortest
+    from retwin.report.labels import counted
 
     rate = monitor.twin.rate
     samples = sum(int(record.mask.any(axis=2).sum()) for record, _ in found)
     events = sum(each.promised for _, watched in found for each in watched.events)
     bound = duration(shortest(events, samples) / rate)
     return (
-        f"This replay of {duration(samples / rate)} shows {events} events; if all was healthy, "
-        f"that alone bounds their rate at one in {bound} (exact 95 %). {_promised(monitor)}"
+        f"This replay of {duration(samples / rate)} shows {counted(events, 'event')}; if all was "
+        f"healthy, that alone bounds their rate at one in {bound} (exact 95 %). {_promised(monitor)}"
     )
 
 
