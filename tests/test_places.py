@@ -86,6 +86,17 @@ def test_what_another_process_has_made_meanwhile_stays() -> None:
     assert [each.name for each in Path("new").iterdir()] == ["b"]
 
 
+def test_a_folder_may_hold_what_the_new_one_lacks_where_that_is_known() -> None:
+    check_place("full", folder=True, holds=("new", "other"))
+    for holds in ((), ("other",)):
+        try:
+            with write_atomically("full", folder=True, holds=holds) as part:
+                (part / "new").touch()
+        except InputError as error:
+            assert not holds, error
+    assert [each.name for each in Path("full").iterdir()] == ["new"]
+
+
 def test_fit_may_replace_what_it_wrote(updated: rt.CorrectedTwin) -> None:
     updated.save("model")
     check_place("model", folder=True, holds=("model.json", "surrogate", "residual"))

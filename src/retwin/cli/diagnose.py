@@ -79,8 +79,8 @@ def fit(
     max_bytes: MaxBytes = None,
 ) -> None:
     """Train a diagnoser on labelled trajectories, or derive one from a corrected twin."""
-    parts = ("model.json", "weights.safetensors", "surrogate", "residual", "twin")
-    check_place(out, folder=True, holds=parts)
+    parts = ("surrogate", "residual", "twin") if model else ()
+    check_place(out, folder=True, holds=("model.json", "weights.safetensors", *parts))
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     if model is None:
         leave_out({"--random-onset": random_onset}, "without --from")

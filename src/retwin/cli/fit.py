@@ -85,12 +85,12 @@ def fit(
     best; or that of --dynamics, of --correction, or of a case with classes.
     """
     import retwin as rt
+    from retwin.evaluation.choice.fitted import HOLDS
     from retwin.evaluation.choice.surrogates import SurrogateSettings
     from retwin.update.residual.fitting import calibrating
     from retwin.update.residual.priors import other_machines
 
-    holds = ("model.json", "weights.safetensors", "surrogate", "residual", "choice.json")
-    check_place(out, folder=True, holds=(*holds, "report.html"))
+    check_place(out, folder=True, holds=HOLDS)
     seconds = seconds_of("--horizon", horizon)
     one_of("--surrogate", surrogate, catalog.SURROGATE_MODES)
     require(

@@ -88,12 +88,14 @@ def fit(
     from retwin.monitor import fit_monitor, possible_causes, visible_sizes
     from retwin.update import DynamicsTwin
 
-    check_place(out, folder=True, holds=("model.json", "weights.safetensors", "twin", "diagnoser"))
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     model = files[0] if files[0].is_dir() and (files[0] / "model.json").is_file() else None
     healthy = files[1:] if model else files
     at_least("FILE", healthy, 1, "file", remedy="name healthy records after the model")
-    if model and kind_of(saved(model)) in catalog.DIAGNOSERS:
+    trajectories = model is not None and kind_of(saved(model)) in catalog.DIAGNOSERS
+    inner = "diagnoser" if trajectories else "twin"
+    check_place(out, folder=True, holds=("model.json", "weights.safetensors", inner))
+    if model and trajectories:
         leave_out({"--lasting": lasting}, "for a diagnoser, which watches whole trajectories")
         _fit_trajectories(model, healthy, out, false_alarms, case, reading, as_json)
         return
@@ -485,9 +487,10 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     samples = sum(int(record.mask.any(axis=2).sum()) for record, _ in found)
     events = sum(each.promised for _, watched in found for each in watched.events)
     bound = duration(shortest(events, samples) / rate)
+    shown = f"{duration(samples / rate)} shows {counted(events, 'event')}"
     return (
-        f"This replay of {duration(samples / rate)} shows {counted(events, 'event')}; if all was "
-        f"healthy, that alone bounds their rate at one in {bound} (exact 95 %). {_promised(monitor)}"
+        f"This replay of {shown}; if all was healthy, that alone bounds their rate at one in "
+        f"{bound} (exact 95 %). {_promised(monitor)}"
     )
 
 

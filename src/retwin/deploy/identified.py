@@ -86,7 +86,7 @@ def save_identification(
     checked = checked or check_with_twin(opened.twin, logs.trajectories)
     values = identification_values(found, opened, logs) | {"records": checked.values}
     start = start_values(found.twin)
-    with write_atomically(folder, folder=True) as part:
+    with write_atomically(folder, folder=True, holds=HOLDS) as part:
         save(logs.trajectories, part / "logs.npz")
         spread = spread_of(found.parameters)
         measured = ("logs.npz", logs.trajectories, spread, logs.columns)

@@ -12,7 +12,7 @@ import re
 import secrets
 import shutil
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -47,7 +47,11 @@ _count = itertools.count()
 
 @contextmanager
 def write_atomically(
-    path: str | os.PathLike[str], *, folder: bool = False, replace: bool = True
+    path: str | os.PathLike[str],
+    *,
+    folder: bool = False,
+    replace: bool = True,
+    holds: Collection[str] = (),
 ) -> Iterator[Path]:
     """A name in the same folder to write to; moved to `path` on success, removed on failure.
 
@@ -56,7 +60,8 @@ def write_atomically(
     above `path` are made. If the block fails, with an exception or Ctrl-C, `path` stays as it was;
     a kill leaves the old contents or the new ones, and hidden files that the next process to write
     there removes. The name keeps the suffix of `path`, since many writers choose their format by
-    it. Without `replace`, what another process has made there meanwhile stays.
+    it. Without `replace`, what another process has made there meanwhile stays. A folder that is
+    replaced may hold the names of the new one, and those of `holds`, which the new one may lack.
 
     Raises
     ------
@@ -82,7 +87,7 @@ def write_atomically(
             yield part
             if not part.exists():
                 raise FileNotFoundError(f"nothing was written for {target.name}")
-            _move(part, target, replace=replace)
+            _move(part, target, replace=replace, holds=holds)
     finally:
         _remove(part)
 
@@ -219,7 +224,7 @@ def _check_kind(target: Path, *, folder: bool) -> None:
         )
 
 
-def _move(part: Path, target: Path, *, replace: bool) -> None:
+def _move(part: Path, target: Path, *, replace: bool, holds: Collection[str]) -> None:
     _check_kind(target, folder=part.is_dir())
     if not replace:
         try:
@@ -234,8 +239,8 @@ def _move(part: Path, target: Path, *, replace: bool) -> None:
         return
     for former in _formers(target):
         shutil.rmtree(former, ignore_errors=True)
-    others = {each.name for each in target.iterdir()} - {each.name for each in part.iterdir()}
-    refuse_others(target, others)
+    names = {each.name for each in part.iterdir()} | set(holds)
+    refuse_others(target, {each.name for each in target.iterdir()} - names)
     if _exchange(part, target):
         return
     # A kill between the two steps leaves no folder of that name: `recover` puts the former back.

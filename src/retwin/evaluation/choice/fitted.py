@@ -19,6 +19,8 @@ from retwin.update.dynamics import DynamicsTwin, FittedDynamics
 
 FILE, PAGE = "choice.json", "report.html"
 """The comparison and its page, in the folder of the model."""
+HOLDS = ("model.json", "weights.safetensors", "surrogate", "residual", FILE, PAGE)
+"""What the folder of a fitted twin may hold, whatever its correction is."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ class Fitted:
 
     def save(self, folder: str | Path, *, page: str = "") -> None:
         """Write the twin as `rt.load_twin` reads it, the comparison, and a page if one is given."""
-        with write_atomically(folder, folder=True) as part:
+        with write_atomically(folder, folder=True, holds=HOLDS) as part:
             self.twin.save(part)
             write_json(part / FILE, self.values)
             if page:
