@@ -187,6 +187,12 @@ def test_a_small_network_is_traced_with_its_weights() -> None:
     assert slope.item() == pytest.approx((net(now)[0] - now[0]).item(), rel=1e-12)
 
 
+@pytest.mark.parametrize("interpolation", ["hold", "linear", "spline"])
+def test_a_single_sample_is_held(interpolation: str) -> None:
+    found = cubic_coefficients(torch.tensor([[[3.0]]], dtype=torch.float64), interpolation)
+    assert found.ravel().tolist() == [3.0, 0.0, 0.0, 0.0]
+
+
 def test_interpolation_is_closed_form() -> None:
     commands = noise(2, 40)
     grid = np.linspace(0, 1, 5)[:-1]

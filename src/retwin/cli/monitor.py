@@ -118,7 +118,9 @@ def fit(
         )
         show("faults that are seen", 0.5)
         causes = possible_causes(made.twin, system and system.alarm_causes)
-        made = replace(made, visible=tuple(visible_sizes(made, given, causes)))
+        seen = partial(show, "faults that are seen")
+        found = visible_sizes(made, given, causes, progress=lambda share: seen((1 + share) / 2))
+        made = replace(made, visible=tuple(found))
     if case:  # by which records are read later too
         made = replace(made, twin=replace(made.twin, case=stored_name(case)))
     made.save(out)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.visible import SHARE, Visible
+from retwin.progress import Progress
 from retwin.twins.collected import SimulationError
 from retwin.twins.faults.actuator_faults import Fault, Stuck
 from retwin.twins.faults.system_faults import (
@@ -38,7 +39,11 @@ HALVINGS = 5
 
 
 def visible_sizes(
-    monitor: Monitor, healthy: Trajectories, faults: Mapping[str, Fault | None]
+    monitor: Monitor,
+    healthy: Trajectories,
+    faults: Mapping[str, Fault | None],
+    *,
+    progress: Progress | None = None,
 ) -> list[Visible]:
     """Which faults the monitor sees, and from what size on.
 
@@ -51,6 +56,8 @@ def visible_sizes(
     faults : mapping of str to Fault or None
         The faults, such as `possible_causes`; of those that have no onset nothing is said. The
         largest size of a range is halved until it is not seen any more.
+    progress : callable, optional
+        Called with the share of the faults that were tried.
 
     Raises
     ------
@@ -62,7 +69,9 @@ def visible_sizes(
     windows = _windows(monitor, healthy)
     within = (windows.steps - windows.lead) / healthy.rate
     made = []
-    for name, fault in faults.items():
+    for number, (name, fault) in enumerate(faults.items()):
+        if progress:
+            progress(number / len(faults))
         if not isinstance(fault, TimedFault | Stuck):
             continue
         largest = _largest(fault)

@@ -29,7 +29,7 @@ def cubic_coefficients(commands: Tensor, interpolation: str) -> Tensor:
     Parameters
     ----------
     commands : Tensor, shape (n, T, d_u)
-        Commands in double precision, T at least 2.
+        Commands in double precision; a single sample is held.
     interpolation : str
         One of `INTERPOLATIONS`.
 
@@ -109,6 +109,8 @@ def _slopes(commands: Tensor) -> Tensor:
     import torch
 
     steps = commands.shape[1]
+    if steps == 1:
+        return torch.zeros_like(commands)
     wanted = steps + 2 * (TAPS + 1)
     while commands.shape[1] < wanted:
         more = min(commands.shape[1] - 1, (wanted - commands.shape[1] + 1) // 2)
