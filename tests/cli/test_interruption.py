@@ -107,6 +107,7 @@ class Interrupts:
             os.kill(os.getpid(), signal.SIGINT)
 
 sys.meta_path.insert(0, Interrupts())
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 from retwin.__main__ import main
 main()
 """
