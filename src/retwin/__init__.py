@@ -53,12 +53,12 @@ as in `rt.twins.HoldSampler` or `from retwin.deploy import Bundle`:
 
 from __future__ import annotations
 
-from retwin._lazy import listed, names
+from retwin._lazy import names, read_stub
 from retwin._version import __version__
 
 # The stub beside this file lists the public names. The module of a name is imported when the name
 # is first used: `import retwin` loads no torch.
-_LISTED = listed(__loader__.get_data(f"{__file__}i").decode())
+_LISTED = read_stub(__loader__.get_data(f"{__file__}i").decode())
 _HOME = {n: m.removeprefix("retwin.") for n, m in sorted(_LISTED.items()) if m.count(".")}
 _ROOMS = tuple(sorted(_LISTED.keys() - _HOME.keys()))
 

@@ -15,7 +15,7 @@ def homes(modules: Mapping[str, str]) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
-def listed(stub: str) -> dict[str, str]:
+def read_stub(stub: str) -> dict[str, str]:
     """Public name to module, from the text of a stub with `from MODULE import NAME as NAME`."""
     lines = (line.split() for line in stub.splitlines())
     return {words[3]: words[1] for words in lines if words[:1] == ["from"]}

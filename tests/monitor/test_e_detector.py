@@ -83,19 +83,19 @@ def test_a_change_that_lasts_is_rarely_over_and_one_that_ended_is_soon(
     lasts = noise + 1.0 if isinstance(alternative, Location) else 2.5 * noise
     change = np.stack([np.arange(400), np.zeros(400, dtype=int)], axis=1)
     given = np.ones(400), change, np.zeros(400)
-    reached = (detector.over(*given, lasts) >= 2000).any(axis=1)
+    reached = (detector.evidence_of_end(*given, lasts) >= 2000).any(axis=1)
     assert reached.mean() <= 300 / 2000
-    assert np.median((detector.over(*given, noise) >= 2000).argmax(axis=1)) < 40
+    assert np.median((detector.evidence_of_end(*given, noise) >= 2000).argmax(axis=1)) < 40
 
 
 def test_evidence_that_a_change_is_over_does_not_depend_on_how_samples_are_grouped() -> None:
     scores = np.random.default_rng(6).normal(size=(2, 50))
     scores[0, 20:30] = np.nan
     detector, change = Detector(), np.array([[0, 3], [1, 9]])
-    whole = detector.over(np.ones(2), change, np.zeros(2), scores)
+    whole = detector.evidence_of_end(np.ones(2), change, np.zeros(2), scores)
     state, evidence, parts = detector.start(2), np.ones(2), []
     for part in np.split(scores, [7, 24, 25], axis=1):
-        parts.append(detector.over(evidence, change, state.previous, part))
+        parts.append(detector.evidence_of_end(evidence, change, state.previous, part))
         evidence = parts[-1][:, -1]
         state, _ = detector.run(state, part)
     assert np.concatenate(parts, axis=1).tobytes() == whole.tobytes()

@@ -75,9 +75,9 @@ def test_evidence_that_a_change_is_over_begins_anew_with_each_alarm() -> None:
     yes, no, counted = np.array([True]), np.array([False]), np.ones((1, 3), dtype=bool)
     change, over = np.array([[1, 7]]), np.array([30.0])
     alarmed = RULES.after(course(), counted, yes, no, no, change, over)
-    assert (alarmed.change.tolist(), alarmed.over.tolist()) == ([[1, 7]], [1.0])
+    assert (alarmed.change.tolist(), alarmed.end_evidence.tolist()) == ([[1, 7]], [1.0])
     later = RULES.after(alarmed, counted, no, no, no, np.zeros((1, 2), dtype=int), over)
-    assert (later.change.tolist(), later.over.tolist()) == ([[1, 7]], [30.0])
+    assert (later.change.tolist(), later.end_evidence.tolist()) == ([[1, 7]], [30.0])
 
 
 def test_an_event_is_a_change_after_the_stated_time() -> None:

@@ -166,10 +166,11 @@ def _write_torque(twin: Any, out: Path, asked: dict[str, Any], *, as_json: bool)
     with bar("export") as show:
         made = export_actuator_net(twin, out, **asked, progress=lambda share: show("train", share))
     names = ("network_file", "input_order", "input_idx", "pos_scale", "vel_scale", "torque_scale")
-    values = vars(made) | {"input_idx": list(made.input_idx)}
+    file, places = str(made.network_file), list(made.input_idx)
+    values = vars(made) | {"network_file": file, "input_idx": places}
     settings = {name: values[name] for name in names}
     answer(
-        settings | values,
+        values,
         table(("of ActuatorNetMLPCfg", "value"), list(settings.items())),
         f"The simulation must call it every {made.period:g} s. Torques are in {made.unit}; their "
         f"error on held-out simulations of the twin, noise included, is {made.error:.2g} of their "

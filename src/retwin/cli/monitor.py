@@ -135,7 +135,7 @@ def fit(
         | {"records": checked.values, "visible": [vars(each) for each in made.visible]},
         *shown_records(checked),
         *([] if known else [box]),
-        _promised(made),
+        _describe_promise(made),
         f"Tried: {tried}",
         *(f"{name}: {text}" for name, text in promises.items()),
         *map(str, made.visible),
@@ -492,11 +492,11 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     shown = f"{duration(samples / rate)} shows {counted(events, 'event')}"
     return (
         f"This replay of {shown}; if all was healthy, that alone bounds their rate at one in "
-        f"{bound} (exact 95 %). {_promised(monitor)}"
+        f"{bound} (exact 95 %). {_describe_promise(monitor)}"
     )
 
 
-def _promised(monitor: Monitor) -> str:
+def _describe_promise(monitor: Monitor) -> str:
     """The rate that is promised, and what it follows from."""
     from retwin.monitor.detect.promise import duration
 

@@ -42,7 +42,7 @@ class Checked:
         """How much of the variance nominal outputs explain, in a sentence; none where unknown."""
         parts = []
         for kind, shares in self._known.items():
-            own = ", ".join(_explained(name, share) for name, share in shares.items())
+            own = ", ".join(_describe_share(name, share) for name, share in shares.items())
             which = "" if len(self.explained) == 1 else f" in {kind} records"
             parts += [f"{own}{which}"] * bool(own)
         return [f"The twin as it was given explains {'; '.join(parts)} (variance)."] * bool(parts)
@@ -118,6 +118,6 @@ def doubtful(records: Trajectories) -> str:
     return "; ".join(summarise(found for each in every for found in find_constant(each)))
 
 
-def _explained(output: str, share: float) -> str:
+def _describe_share(output: str, share: float) -> str:
     """What is explained of an output, in words where it is less than nothing."""
     return f"{100 * share:.0f} % of {output}" if share >= 0 else f"less of {output} than its mean"

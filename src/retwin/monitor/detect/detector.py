@@ -169,7 +169,7 @@ class Detector:
             made[t] = np.add.accumulate(evidence * weights, axis=0)[-1]
         return DetectorState(evidence.T, previous), made.T
 
-    def over(
+    def evidence_of_end(
         self,
         evidence: NDArray,
         change: NDArray,
@@ -180,7 +180,7 @@ class Detector:
         """Evidence (n, T) that one change in each of n machines is over, by CUSUM.
 
         It is M of the alternative's bets upside down: while the change lasts it reaches A after
-        more than about A samples, on average.
+        about A samples, on average, or later.
 
         Parameters
         ----------

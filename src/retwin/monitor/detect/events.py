@@ -39,8 +39,8 @@ class Course:
         (n,), samples of which evidence was counted since the detector began anew.
     change : NDArray
         (n, 2), stream and number of the alternative of the newest alarm.
-    over : NDArray
-        (n,), evidence that this change is over, see `Detector.over`.
+    end_evidence : NDArray
+        (n,), evidence that this change is over, see `Detector.evidence_of_end`.
 
     """
 
@@ -49,7 +49,7 @@ class Course:
     event: NDArray
     quiet: NDArray
     change: NDArray
-    over: NDArray
+    end_evidence: NDArray
 
     @classmethod
     def start(cls, count: int) -> Course:
@@ -88,10 +88,16 @@ class Rules:
         """Where an alarm is raised."""
         return np.asarray(evidence >= self.arl)
 
-    def ends(self, course: Course, evidence: NDArray, over: NDArray, counted: NDArray) -> NDArray:
+    def ends(
+        self, course: Course, evidence: NDArray, end_evidence: NDArray, counted: NDArray
+    ) -> NDArray:
         """Where (n, T) an event ends, for machines that began a part with `course`."""
         quiet = course.quiet[:, None] + np.cumsum(counted, axis=1)
-        calm = (quiet >= self.wanted) & (evidence * CERTAIN < quiet) & (over * CERTAIN >= quiet)
+        calm = (
+            (quiet >= self.wanted)
+            & (evidence * CERTAIN < quiet)
+            & (end_evidence * CERTAIN >= quiet)
+        )
         return np.asarray((course.event >= 0)[:, None] & calm & counted)
 
     def changes(self, course: Course, steps: int) -> NDArray:
@@ -107,12 +113,12 @@ class Rules:
         ended: NDArray,
         changed: NDArray,
         change: NDArray,
-        over: NDArray,
+        end_evidence: NDArray,
     ) -> Course:
         """The course after a part of T samples.
 
         `counted` is (n, T); an alarm, an end and a change of the machine (n,) are those of its last
-        sample, and so is what an alarm is for, `change` (n, 2), and the evidence `over` (n,).
+        sample, and so is what an alarm is for, `change` (n, 2), and `end_evidence` (n,).
         """
         last = course.samples + counted.shape[1] - 1
         opened = np.where(alarm & (course.event < 0), last, course.event)
@@ -123,5 +129,5 @@ class Rules:
             np.where(ended | changed, -1, opened),
             np.where(anew, 0, course.quiet + counted.sum(axis=1)),
             np.where(alarm[:, None], change, course.change),
-            np.where(anew, 1.0, over),
+            np.where(anew, 1.0, end_evidence),
         )

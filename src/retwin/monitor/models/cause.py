@@ -314,18 +314,18 @@ def find_cause(
     if len(own) < len(alarms):
         first = max(first, min(alarms[0].sample + 1, opening - MIN_WINDOW))
 
-    def inferred(begin: int) -> Cause:
-        return _inferred(twin, record, begin, alarm, faults, known_start and begin == 0)
+    def infer(begin: int) -> Cause:
+        return _infer(twin, record, begin, alarm, faults, known_start and begin == 0)
 
     def likely(cause: Cause) -> bool:
         return cause.probability * (1 - cause.unknown) > PROBABLE
 
     start = max(0, first)
     if len(own) == 1:
-        return inferred(start)
-    whole = inferred(start) if alarm.sample - opening <= before else None
+        return infer(start)
+    whole = infer(start) if alarm.sample - opening <= before else None
     begin = max(0, own[-2].sample + 1, alarm.sample - before)
-    cause = whole if whole is not None and likely(whole) else inferred(begin)
+    cause = whole if whole is not None and likely(whole) else infer(begin)
     same = cause.name in (current, HEALTHY) or not likely(cause)
     known = faults.get(current)
     if not same and isinstance(known, TimedFault):
@@ -337,7 +337,7 @@ def find_cause(
     return replace(cause, same=same)
 
 
-def _inferred(
+def _infer(
     twin: DynamicsTwin,
     record: Trajectories,
     first: int,

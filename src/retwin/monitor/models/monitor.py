@@ -247,12 +247,14 @@ class Monitor:
         counted = np.isfinite(low).reshape(count, len(self.slack), -1).any(axis=1)
         rules = self.rules
         alarm = rules.alarms(total)
-        over = np.ones(total.shape)
+        end_evidence = np.ones(total.shape)
         if not learn.all():
             change = state.course.change + [[len(self.slack), 0]] * np.arange(count)[:, None]
-            given = state.course.over, change, state.detector.previous
-            over = np.where(learn[:, None], over, streams.detector.over(*given, low, high))
-        ended = rules.ends(state.course, total, over, counted) & ~alarm
+            given = state.course.end_evidence, change, state.detector.previous
+            end_evidence = np.where(
+                learn[:, None], end_evidence, streams.detector.evidence_of_end(*given, low, high)
+            )
+        ended = rules.ends(state.course, total, end_evidence, counted) & ~alarm
         outside = self._outside(commands)
         changed = rules.changes(state.course, samples) & ~ended
         filters = tuple(
@@ -273,7 +275,7 @@ class Monitor:
         )
         deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
         flags = alarm, ended, changed, counted, outside
-        return Part(after, mean, deviation, low, high, evidence, total, over, *flags)
+        return Part(after, mean, deviation, low, high, evidence, total, end_evidence, *flags)
 
     def _after(
         self,
@@ -302,7 +304,7 @@ class Monitor:
         most = part.evidence[:, -1].reshape(-1, each).argmax(axis=1)
         weighed = after.detector.evidence.reshape(len(alarm), each, -1)[rows, most]
         change = np.stack([most, (weighed * streams.detector.bets.weights).argmax(axis=1)], axis=1)
-        ends = part.counted, alarm, ended, changed, change, part.over[:, -1]
+        ends = part.counted, alarm, ended, changed, change, part.end_evidence[:, -1]
         course = self.rules.after(course, *ends)
         for machine in np.flatnonzero(alarm):
             stream, number = change[machine].tolist()

@@ -25,7 +25,7 @@ class Part:
     high: NDArray
     evidence: NDArray
     total: NDArray
-    over: NDArray
+    end_evidence: NDArray
     alarm: NDArray
     ended: NDArray
     changed: NDArray
