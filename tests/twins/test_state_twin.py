@@ -217,6 +217,15 @@ def test_interpolation_is_closed_form() -> None:
         np.testing.assert_allclose(c, wanted, atol=1e-12)
 
 
+def test_a_causal_spline_ends_at_the_next_sample() -> None:
+    commands = np.concatenate([np.tile(noise(2, 1), (1, 25, 1)), noise(2, 40)], axis=1)
+    found = cubic_coefficients(torch.as_tensor(commands), "spline", causal=True).numpy()
+    for k in range(25, 64):
+        until = CubicSpline(range(k + 2), commands[:, : k + 2], axis=1, bc_type="natural")
+        np.testing.assert_allclose(found[:, k, 1], until(k, 1), atol=1e-11)
+        np.testing.assert_allclose(found[:, k].sum(axis=1), commands[:, k + 1], atol=1e-11)
+
+
 def test_it_solves_the_equations() -> None:
     commands = noise(1, 100)
     twin = duffing(interpolation="linear", substeps=8)

@@ -34,6 +34,9 @@ class Steps:
         Of the commands between samples.
     delays : tuple of (int, int)
         Indices of the commands with a dead time, and of the parameters that are these.
+    causal : bool
+        Whether commands between samples depend on earlier samples and the next one alone, as while
+        a system runs.
 
     """
 
@@ -42,6 +45,7 @@ class Steps:
     substeps: int
     interpolation: str
     delays: tuple[tuple[int, int], ...] = ()
+    causal: bool = False
 
     def run(
         self,
@@ -231,7 +235,8 @@ class Steps:
         if self.delays:
             places, parameters = (list(each) for each in zip(*self.delays, strict=True))
             commands = delayed(commands, places, theta[:, parameters], self.period)
-        return cubic_coefficients(commands, self.interpolation)[:, first:]
+        made = cubic_coefficients(commands, self.interpolation, causal=self.causal)
+        return made[:, first:]
 
     def acting(self, commands: NDArray, theta: NDArray) -> NDArray:
         """Commands (n, T, d_u) as they act at each sample, after their dead times."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from math import ceil, sqrt
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,7 @@ MAX_TRIED = 100
 """Dead times at most that are tried before a search: a linear step at each takes ms."""
 
 
-def cubic_coefficients(commands: Tensor, interpolation: str) -> Tensor:
+def cubic_coefficients(commands: Tensor, interpolation: str, *, causal: bool = False) -> Tensor:
     """Polynomials c0 + c1 s + c2 s² + c3 s³ of the commands from each sample, s = 0, to the next.
 
     Parameters
@@ -32,6 +33,9 @@ def cubic_coefficients(commands: Tensor, interpolation: str) -> Tensor:
         Commands in double precision; a single sample is held.
     interpolation : str
         One of `INTERPOLATIONS`.
+    causal : bool
+        Whether the polynomial to a sample depends on this and earlier samples alone, as while a
+        system runs: a spline then ends there.
 
     Returns
     -------
@@ -47,8 +51,11 @@ def cubic_coefficients(commands: Tensor, interpolation: str) -> Tensor:
     if interpolation == "linear":
         parts = [held, rise, zero, zero]
     elif interpolation == "spline":
-        slope = _slopes(commands)
-        first, last = slope[:, :-1], slope[:, 1:]
+        if causal:
+            first, last = _last_slopes(commands)
+        else:
+            slopes = _slopes(commands)
+            first, last = slopes[:, :-1], slopes[:, 1:]
         parts = [held, first, 3 * rise - 2 * first - last, first + last - 2 * rise]
     end = [commands[:, -1:], *[torch.zeros_like(commands[:, -1:])] * 3]
     return torch.cat([torch.stack(parts, 2), torch.stack(end, 2)], dim=1)
@@ -125,3 +132,28 @@ def _slopes(commands: Tensor) -> Tensor:
         both = (rises[:, TAPS + sign * j : TAPS + sign * j + steps] for sign in (-1, 1))
         slopes = slopes.add(sum(both), alpha=weight)
     return slopes
+
+
+def _last_slopes(commands: Tensor) -> list[Tensor]:
+    """The last two slopes, each (n, T - 1, d_u), of the splines that end at samples 1 to T - 1.
+
+    Before the first sample the command is the first one.
+    """
+    import torch
+
+    count = commands.shape[1] - 1
+    samples = torch.cat([commands[:, :1].expand(-1, TAPS - 1, -1), commands], dim=1)
+    windows = [samples[:, j : j + count] for j in range(TAPS + 1)]
+    # Added one after the other: the same bytes for a sample in a record of any length.
+    return [
+        sum((weight * each for weight, each in zip(row, windows, strict=True)), commands[:, 1:] * 0)
+        for row in _last_weights()
+    ]
+
+
+@cache
+def _last_weights() -> list[list[float]]:
+    """By how much each of the last samples counts in a spline's last two slopes."""
+    import torch
+
+    return _slopes(torch.eye(TAPS + 1, dtype=torch.float64)[None])[0, -2:].tolist()

@@ -143,25 +143,6 @@ class OnlineFilter:
 
         """
         learn = np.ones(len(commands), dtype=bool) if learn is None else learn
-        if self.twin.equations.interpolation != "spline":
-            return self._advance(state, commands, measured, seen, learn)
-        found = []
-        for t in range(commands.shape[1]):  # a later command would change the spline
-            part = slice(t, t + 1)
-            own = commands[:, part], measured[:, part], seen[:, part]
-            state, *more = self._advance(state, *own, learn)
-            found.append(more)
-        mean, covariance = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
-        return state, mean, covariance
-
-    def _advance(
-        self,
-        state: FilterState,
-        commands: NDArray,
-        measured: NDArray,
-        seen: NDArray,
-        learn: NDArray,
-    ) -> tuple[FilterState, NDArray, NDArray]:
         earlier = np.where(np.isnan(state.commands), commands[:, :1], state.commands)
         path = np.concatenate([earlier, commands], axis=1)
         count, moved, states = state.states.shape
@@ -170,7 +151,8 @@ class OnlineFilter:
         # The sample before is that of `state`, and was used.
         pad = [(0, 0), (1, 0), (0, 0)]
         given = np.pad(np.where(seen, measured, 0.0), pad), np.pad(seen, pad)
-        steps, first = self.twin.equations.steps(), earlier.shape[1] - 1
+        steps = replace(self.twin.equations.steps(), causal=True)
+        first = earlier.shape[1] - 1
         process, simulated = self.twin.process, state.simulated
         if self.twin.proportional.any():
             own = np.concatenate([theta[::moved, :-states], simulated], axis=1)
