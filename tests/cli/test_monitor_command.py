@@ -12,9 +12,9 @@ import pytest
 from scipy.signal import lfilter
 
 import retwin as rt
-from retwin.cli.monitor import _event_rows, _written
+from retwin.cli.monitor import _event_rows
 from retwin.monitor import Alarm
-from retwin.monitor.models.cause import Cause
+from retwin.monitor.models.cause import Cause, cause_text
 from retwin.twins import ParameterShift
 from retwin.update import DynamicsTwin
 
@@ -37,16 +37,19 @@ def test_a_cause_is_written_with_its_time_size_and_probability_where_it_has_them
     nothing, alarm = (np.nan,) * 3, Alarm("tank", 3, 3.0, "level", "higher than predicted", 1e6, 3)
     named = {"leaking": 0.3, "Healthy": 0.7}
     none = Cause(alarm, "Healthy", 0.7, 0.9, nothing, nothing, named)
-    assert _written(none) == "no known fault; probability 0.70"
+    assert cause_text(vars(none), "") == "no known fault; probability 0.70"
     leaking = Cause(alarm, "leaking", 0.7, 0.0, (0.2, 0.1, 0.3), (2.0, 1.0, 3.0), named, unit="1/s")
-    assert _written(leaking) == "leaking from 2 s; size 0.2 1/s (0.1 to 0.3), probability 0.70"
+    assert (
+        cause_text(vars(leaking), "2 s")
+        == "leaking from 2 s; size 0.2 1/s (0.1 to 0.3), probability 0.70"
+    )
     more = replace(leaking, unknown=0.9, unit="1")
-    assert _written(more) == (
+    assert cause_text(vars(more), "2 s") == (
         "leaking from 2 s, and more than that; size 0.2 (0.1 to 0.3), "
         "probability 0.70 among the known causes"
     )
     frozen = replace(leaking, size=nothing, unit="")
-    assert _written(frozen) == "leaking from 2 s; probability 0.70"
+    assert cause_text(vars(frozen), "2 s") == "leaking from 2 s; probability 0.70"
 
 
 def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:

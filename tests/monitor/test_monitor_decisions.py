@@ -23,7 +23,7 @@ from retwin.monitor.live.status import AssetStatus
 from retwin.monitor.live.stream_machine import BEHIND, TOLERATED, WINDOW, StreamMachine, Work
 from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.models import cause, visibility
-from retwin.monitor.models.cause import MIN_WINDOW, PROBABLE, Cause, cause_text, is_due
+from retwin.monitor.models.cause import MIN_WINDOW, PROBABLE, Cause, cause_data, cause_text, is_due
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import BEYOND, Monitor
 from retwin.monitor.models.parts import Part
@@ -472,7 +472,8 @@ def test_a_promise_names_trajectories_that_were_not_used() -> None:
 
 def test_there_is_more_to_a_cause_where_the_unknown_is_probable() -> None:
     for unknown, more in ((PROBABLE, False), (np.nextafter(PROBABLE, 1), True)):
-        assert ("more than that" in cause_text("leak", "noon", unknown)) is more
+        text = cause_text(cause_data("leak", 0.9, unknown, {}), "noon")
+        assert ("more than that" in text) is ("among the known causes" in text) is more
 
 
 LEAK = ParameterShift("drain", size=(0.1, 1.0), onset=(0.0, 5.0))

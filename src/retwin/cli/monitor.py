@@ -41,7 +41,7 @@ from retwin.cli.reading import (
 )
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.quality.check import check_records
-from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
 
@@ -413,24 +413,16 @@ def _causes(
         return find_causes(monitor.twin, record, alarms, faults)
 
 
-def _written(cause: Cause) -> str:
-    """A cause with its onset, size and probability, and whether there is more to it."""
-    from retwin.monitor.models.cause import PROBABLE, cause_text
-
-    since = "" if isnan(cause.onset[0]) else f"{cause.onset[0]:.6g} s"
-    value, low, high = cause.size
-    of = f" {cause.unit}" if cause.unit not in ("", "1") else ""
-    size = "" if isnan(value) else f"size {value:.3g}{of} ({low:.3g} to {high:.3g}), "
-    text = cause_text(cause.name, since, cause.unknown)
-    more = cause.unknown > PROBABLE and cause.name != HEALTHY
-    among = " among the known causes" if more else ""
-    return f"{text}; {size}probability {cause.probability:.2f}{among}"
-
-
 def _event_rows(
     watched: Watched, causes: Sequence[Cause], rate: float
 ) -> list[tuple[str, str, str, str, str]]:
     """Each event with its begin and end, and its causes as they became known."""
+    from retwin.monitor.models.cause import cause_text
+
+    def text(cause: Cause) -> str:
+        onset = cause.onset[0]
+        return cause_text(vars(cause), "" if isnan(onset) else f"{onset:.6g} s")
+
     ends = {(each.trajectory, each.event): each for each in watched.endings}
     rows = []
     for first in watched.events:
@@ -445,8 +437,8 @@ def _event_rows(
         end = ends.get((first.trajectory, first.event))
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
-        cause_names = "; then ".join(map(_written, named))
-        rows.append((first.trajectory, f"{first.time:.6g}", until, what, cause_names))
+        begin, texts = f"{first.time:.6g}", "; then ".join(map(text, named))
+        rows.append((first.trajectory, begin, until, what, texts))
     return rows
 
 

@@ -240,4 +240,4 @@ def _data(cause: Cause, first: int) -> dict[str, Any]:
     size = [each if np.isfinite(each) else None for each in cause.size]
     onset = [first + round(each * SECOND) if np.isfinite(each) else None for each in cause.onset]
     shares = cause.probability, cause.unknown, cause.probabilities
-    return cause_data(cause.name, *shares, size, onset) | {"same": cause.same}
+    return cause_data(cause.name, *shares, size, cause.unit, onset) | {"same": cause.same}

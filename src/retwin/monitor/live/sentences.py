@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from retwin.monitor.models.cause import cause_text, cause_title
+from retwin.monitor.models.cause import cause_text
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.samples import SECOND
 
@@ -25,11 +25,8 @@ def sentence(entry: Entry) -> str:
         onset = data["onset"][0]
         if data.get("same"):
             return ""  # the event has its cause
-        found = cause_text(
-            data["name"], "" if onset is None else moment_text(onset), data["unknown"]
-        )
-        text = f"cause of alarm {data['alarm']}: {found}"
-        return f"{data['asset']}: {text} (probability {data['probability']:.2f})"
+        found = cause_text(data, "" if onset is None else moment_text(onset))
+        return f"{data['asset']}: cause of alarm {data['alarm']}: {found}"
     texts = {
         "alarm": "ALARM {sequence}: {output}, {change}",
         "remark": "remark, for which nothing is promised: {output}, {change}",
@@ -42,8 +39,7 @@ def sentence(entry: Entry) -> str:
         return ""  # an event is one line, though more alarms belong to it
     text = texts[entry.kind].format(sequence=entry.sequence, **data)
     if "cause" in data:
-        name, probability = cause_title(data["cause"]["name"]), data["cause"]["probability"]
-        text += f", cause: {name}, probability {probability:.2f}"
+        text += f", cause: {cause_text(data['cause'], '')}"
     return f"{data['asset']}: {text} ({moment_text(data['time'])})"
 
 

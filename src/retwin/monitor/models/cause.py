@@ -93,10 +93,20 @@ def cause_title(name: str) -> str:
     return "no known fault" if name == HEALTHY else name
 
 
-def cause_text(name: str, since: str, unknown: float) -> str:
-    """A cause with its onset, "" where that is not known, and whether there is more to it."""
-    more = ", and more than that" if since and unknown > PROBABLE else ""
-    return f"{cause_title(name)}{f' from {since}' if since else ''}{more}"
+def cause_text(cause: Mapping[str, Any], since: str) -> str:
+    """A cause with its onset, size and probability, and whether there is more to it.
+
+    Of a `Cause` as a mapping, or of `cause_data`; `since` is its onset, "" where that is not known.
+    """
+    more = cause["unknown"] > PROBABLE and cause["name"] != HEALTHY
+    text = cause_title(cause["name"]) + (f" from {since}" if since else "")
+    text += ", and more than that" if since and more else ""
+    value, low, high = cause["size"]
+    of = f" {cause['unit']}" if cause["unit"] not in ("", "1") else ""
+    known = value is not None and np.isfinite(value)
+    size = f"size {value:.3g}{of} ({low:.3g} to {high:.3g}), " if known else ""
+    among = " among the known causes" if more else ""
+    return f"{text}; {size}probability {cause['probability']:.2f}{among}"
 
 
 def size_unit(fault: Fault | None, twin: DynamicsTwin) -> str:
@@ -118,6 +128,7 @@ def cause_data(
     unknown: float,
     probabilities: Mapping[str, float],
     size: Sequence[float | None] = (None,) * 3,
+    unit: str = "",
     onset: Sequence[float | None] = (None,) * 3,
 ) -> dict[str, Any]:
     """A cause as data of the log, None where there is no number; see `Cause`.
@@ -129,6 +140,7 @@ def cause_data(
         "probability": probability,
         "unknown": unknown,
         "size": list(size),
+        "unit": unit,
         "onset": list(onset),
         "probabilities": dict(probabilities),
     }

@@ -17,7 +17,7 @@ from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.live import Live
 from retwin.monitor.live.machine import Recent
 from retwin.monitor.live.status import AssetStatus
-from retwin.monitor.models.cause import possible_causes, size_unit
+from retwin.monitor.models.cause import possible_causes
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor, pace
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
@@ -192,7 +192,7 @@ class Views:
         }
 
     def _explained(self, alarm: Mapping[str, Any], twins: Mapping[str, str]) -> dict[str, Any]:
-        """An alarm of the log, its cause with the unit of its size and what to check."""
+        """An alarm of the log, its cause and what to check."""
         twin = twins[alarm["asset"]]
         monitor = self._monitor(twin, alarm["version"])
         made = {**alarm, "arl": monitor.arl}
@@ -200,7 +200,6 @@ class Views:
             cause = dict(alarm["cause"])
             fault = self._causes(twin, alarm["version"]).get(cause["name"])
             cause["onset"] = [None if each is None else each / SECOND for each in cause["onset"]]
-            cause["unit"] = "" if cause["size"][0] is None else size_unit(fault, monitor.twin)
             cause["check"] = what_to_check(cause["name"], fault, monitor)
             made["cause"] = cause
         return made
