@@ -28,6 +28,7 @@ from retwin.report.labels import (
 from retwin.report.study import Study
 from retwin.report.uses import RULE, use_rows
 from retwin.report.verdict import headline
+from retwin.scores.change import ErrorChange
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 from retwin.scores.segments import median_error_trajectory
 from retwin.scores.uses import error_of
@@ -141,8 +142,11 @@ def picture(study: Study) -> Figure | None:
     pair = headline(study.results)
     if pair is None:
         return None
+    measured = error_of(study.results, study.arrays)
+    if measured is not None:
+        pair = measured[-1], pair[1]
     shown = _trajectory(study, pair) or _record(study, pair)
-    bars = _bars(study, pair)
+    bars = None if measured is None else _bars(study, *measured)
     panels = [each for each in (shown, bars) if each is not None]
     if not panels:
         return None
@@ -220,12 +224,8 @@ def _panel(
     return Panel(x, [Row(Axis(name, unit), marks)], alt, title, height=270)
 
 
-def _bars(study: Study, pair: tuple[str, str]) -> Panel | None:
-    """The error of each output before and after the update."""
-    measured = error_of(study.results, study.arrays)
-    if measured is None:
-        return None
-    change, given, _ = measured
+def _bars(study: Study, change: ErrorChange, given: str, source: str) -> Panel:
+    """The error of each output before and after the update, in a given unit."""
     factor, unit = (1.0, "σ") if given == "σ" else quantity(given)
     before, after = factor * change.outputs_before, factor * change.outputs_after
     names = study.results.outputs.names
@@ -239,7 +239,7 @@ def _bars(study: Study, pair: tuple[str, str]) -> Panel | None:
         bar(place + shift + np.array([0.0, BAR]), np.array([value]), title, colour)
         for values, shift, title, colour in (
             (before, -BAR, "before", "muted"),
-            (after, 0.0, "after", colour_of(pair[0])),
+            (after, 0.0, "after", colour_of(source)),
         )
         for place, value in enumerate(values)
         if math.isfinite(value)
