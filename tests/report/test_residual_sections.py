@@ -15,11 +15,13 @@ from retwin.errors import InputError
 from retwin.report.figures.figure import Band, Figure, Line, Points, Spans
 from retwin.report.figures.plotly_specs import panel_spec
 from retwin.report.figures.png import draw
+from retwin.report.labels import source_name
 from retwin.report.page import render
 from retwin.report.sections import sections_of
 from retwin.report.sections.delta import delta
 from retwin.report.sections.residuals import residuals
 from retwin.report.study import Study
+from retwin.report.summary import picture
 from retwin.results import Results
 
 RATE, LAG = 50.0, 5
@@ -115,6 +117,18 @@ def test_both_renderers_draw_them(simulated: Content) -> None:
     for figure in figures_of(simulated).values():
         assert draw(figure).axes
         assert all(panel_spec(panel)["data"] for panel in figure.panels)
+
+
+def test_the_first_figure_shows_the_source_of_its_errors(simulated: Content) -> None:
+    about, arrays = simulated
+    about["sources"] |= {"ibg_rg": {"rmse": [0.1], "nrmse": [0.1]}}
+    about["comparisons"] = [{"a": "ibg_rg", "b": "twin", "metric": "rmse", "mean_diff": -0.1}]
+    arrays["simulation/ibg_rg/mean"] = arrays["simulation/twin/mean"] + 1.0
+    drawn = picture(study_of(simulated))
+    assert drawn is not None
+    assert drawn.keys[2].text.startswith(f"after: {source_name('pi_ls')}")
+    after = [each for each in marks(drawn, Line) if each.name.startswith("after")]
+    np.testing.assert_array_equal(after[0].y, arrays["simulation/pi_ls/mean"][0, :, 0])
 
 
 def test_older_studies_mark_no_extrapolation(simulated: Content) -> None:
