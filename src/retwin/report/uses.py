@@ -18,7 +18,8 @@ TITLES = {
 """Heads of the rows."""
 RULE = (
     "“Yes” and “no” need the whole 95 % interval within or outside the requirement; “likely” is a "
-    "value within it. The best updated source on these runs is shown: expect a little less."
+    "value within it whose interval is not, or is that of too few records or trainings; “cannot "
+    "say” is the rest. The best updated source on these runs is shown: expect a little less."
 )
 """The one rule, as a sentence."""
 WIDEST = 0.3
@@ -43,9 +44,10 @@ class UseRow:
 def use_rows(results: Results) -> list[UseRow]:
     """A row for each use of a study."""
     limits = {"rate": RATE, "detection": DETECTION, "coverage": COVERAGE, "widest": WIDEST}
+    limits |= {"classes": bool(results.classes), "emulated": results.emulated}
     rows = []
     for use in results.uses:
-        texts = sentences("uses", use=use, classes=bool(results.classes), **limits)
+        texts = sentences("uses", use=use, **limits)
         emulated = results.emulated and use.answer != "cannot say"
         scope = "on emulated data" if emulated else ""
         source = source_name(use.source) if use.source else ""
