@@ -17,6 +17,7 @@ from fmus import c_fmu
 
 import retwin as rt
 from retwin.cases.updated_case import updated_case
+from retwin.cli.reading import read
 from retwin.update import identification
 
 RATE = 50.0
@@ -361,14 +362,18 @@ def test_saved_trajectories_are_matched_by_name_and_unit(place: Path, call) -> N
     commands = np.stack([steps(rng, 200, low=0) for _ in range(4)])[..., None]
     made = truth.simulate(commands, seed=0)
     made = made.replace(observed=made.observed + 0.01 * rng.normal(size=made.observed.shape))
-    swapped = rt.Channels(("height",), ("m",))
-    rt.save(made.replace(outputs=swapped, labels=None), "saved.npz")
+    named = [rt.Channels(("height",), (unit,)) for unit in ("m", "cm")]
+    rt.save(made.replace(outputs=named[0], labels=None), "saved.npz")
+    rt.save(made.replace(outputs=named[1], observed=100 * made.observed, labels=None), "cm.npz")
     words = ("--inputs", "valve", "--outputs", "level", "--rate", "1", "--free", "gain=0:1")
     name = "identify_module:filled"
     column = ("--column", "level=height")
     code, _, err = call("identify", name, "saved.npz", *words, *column, "--out", "out")
     assert code == 0, err
     assert contains(result(), "gain", 0.15)
+    found = rt.cases.read_logs(["cm.npz"], case.twin, rt.cases.Columns({"level": "height"}))
+    assert (found.trajectories.outputs.units, "level: cm to m" in found.notes[0]) == (("m",), True)
+    np.testing.assert_allclose(found.trajectories.observed, made.observed, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -394,17 +399,21 @@ def test_columns_that_are_named_once_are_known_to_later_commands(place: Path, ca
 
 
 def test_a_mapping_is_remembered_too(place: Path, call) -> None:
-    Path("own.csv").write_text(
-        Path("tank0.csv").read_text("utf-8").replace("valve,level", "a,b"), "utf-8"
-    )
+    rows = Path("tank0.csv").read_text("utf-8").splitlines()[1:]
+    stamps = (f"1|2|2026 00-{i // 60:02d}-{i % 60:02d}" for i in range(len(rows)))
+    rows = [f"{stamp},{row}" for stamp, row in zip(stamps, rows, strict=True)]
+    Path("own.csv").write_text("\n".join(["stamp,a,b", *rows]), "utf-8")
     Path("m.toml").write_text(
-        'rate = 1\n[time]\nrate = 1\n[commands.valve]\nsignal = "a"\n'
-        '[outputs.level]\nsignal = "b"\n',
+        'rate = 1\n[time]\ncolumn = "stamp"\nformat = "%d|%m|%Y %H-%M-%S"\n'
+        '[commands.valve]\nsignal = "a"\n[outputs.level]\nsignal = "b"\n',
         "utf-8",
     )
     code, _, err = call("identify", "tank.toml", "own.csv", "--mapping", "m.toml", "--out", "out")
     assert code == 0, err
-    assert rt.cases.get("out/updated.toml").logs.mapping == Path("m.toml").resolve()
+    case = rt.cases.get("out/updated.toml")
+    assert case.logs.mapping == Path("m.toml").resolve()
+    found, plain = read(Path("own.csv"), case), read(Path("tank0.csv"), case)
+    np.testing.assert_array_equal(found.observed, plain.observed)
 
 
 def test_the_page_needs_nothing_else_and_shows_names_as_text(place: Path, call) -> None:

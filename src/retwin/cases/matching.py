@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from retwin.cases.named_signals import check_there
 from retwin.checks import require
+from retwin.data.logs.units import converted
 from retwin.data.trajectories import HEALTHY, Channels, Trajectories
 from retwin.errors import InputError
 from retwin.twins.twin import Twin
@@ -45,7 +47,7 @@ def match_twin(
     Raises
     ------
     InputError
-        Another rate or unit, a command that is missing, or all outputs.
+        Another rate, a unit that is not converted, a command that is missing, or all outputs.
 
     """
     require(
@@ -55,8 +57,8 @@ def match_twin(
         got=f"{found.rate:g} Hz",
         remedy="resample the log, or give --rate to a twin that takes one",
     )
-    inputs = _places(found.inputs, twin.inputs, names, name, "command")
-    outputs = _places(found.outputs, twin.outputs, names, name, "output")
+    inputs = _places(found.inputs, twin.inputs, names, name, "u")
+    outputs = _places(found.outputs, twin.outputs, names, name, "y")
     lacking = [n for n, at in zip(twin.inputs.names, inputs, strict=True) if at is None]
     there = [at is not None for at in outputs]
     require(
@@ -76,13 +78,10 @@ def match_twin(
         text = f"the twin states no units of {', '.join(taken)}: taken as those of the log"
         text += ", so that 100 % is 100 and not 1" * any("(%)" in each for each in taken)
         notes.setdefault(text, []).append(name)
-    shape = (*found.observed.shape[:2], len(outputs))
-    observed, mask = np.zeros(shape), np.zeros(shape, dtype=bool)
-    for channel, at in enumerate(outputs):
-        if at is not None:
-            observed[..., channel] = found.observed[..., at]
-            mask[..., channel] = found.mask[..., at]
-    commands = found.commands[..., [at for at in inputs if at is not None]]
+    commands = _columns(found.commands, found.inputs, inputs, twin.inputs, name, notes)
+    observed = _columns(found.observed, found.outputs, outputs, twin.outputs, name, notes)
+    none = np.zeros(found.mask.shape[:2], dtype=bool)
+    mask = np.stack([none if at is None else found.mask[..., at] for at in outputs], axis=-1)
     return found.replace(
         commands=commands,
         nominal=twin.simulate(commands, seed=0).nominal,
@@ -95,29 +94,39 @@ def match_twin(
 
 
 def _places(
-    own: Channels, wanted: Channels, names: Mapping[str, str], name: str, what: str
+    own: Channels, wanted: Channels, names: Mapping[str, str], name: str, prefix: str
 ) -> list[int | None]:
     """Where each channel of the twin is among those of a log; None where it is not."""
-    prefix = "u" if what == "command" else "y"
     if own == Channels.numbered(prefix, len(wanted)):
         return list(range(len(wanted)))  # a log whose channels nobody has named
     places: list[int | None] = []
-    for channel, unit in zip(wanted.names, wanted.units, strict=True):
+    for channel in wanted.names:
         column = names.get(channel, channel)
         if channel in names:
             check_there(name, column, own.names)
-        at = own.names.index(column) if column in own.names else None
-        if at is not None:
-            other = own.units[at]
-            require(
-                unit == other or "1" in (unit, other),
-                name,
-                expected=f"{what} {channel} in {unit}, the unit of the twin",
-                got=other,
-                remedy="convert the log",
-            )
-        places.append(at)
+        places.append(own.names.index(column) if column in own.names else None)
     return places
+
+
+def _columns(
+    values: NDArray,
+    own: Channels,
+    places: Sequence[int | None],
+    wanted: Channels,
+    name: str,
+    notes: dict[str, list[str]],
+) -> NDArray:
+    """Values (n, T, d) of the channels of the twin in its units; 0 of those that are not there."""
+    made = np.zeros((*values.shape[:2], len(places)))
+    for place, (at, channel) in enumerate(zip(places, wanted.names, strict=True)):
+        if at is None:
+            continue
+        source, target = own.units[at], wanted.units[place]
+        made[..., place] = values[..., at]
+        if source != target and "1" not in (source, target):
+            made[..., place] = converted(values[..., at], source, target, f"{name}, {channel}")
+            notes.setdefault(f"{channel}: {source} to {target}", []).append(name)
+    return made
 
 
 def _units_taken(own: Channels, wanted: Channels, places: Sequence[int | None]) -> list[str]:

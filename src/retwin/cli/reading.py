@@ -15,6 +15,7 @@ from retwin.cli.terminal import bar, note, table
 from retwin.data.io import DataCase, load
 from retwin.data.logs.reading import is_log
 from retwin.data.trajectories import Trajectories
+from retwin.errors import InputError
 from retwin.serialisation.models import kind_of
 
 if TYPE_CHECKING:
@@ -181,8 +182,11 @@ def _names_channels(file: Path, twin: Twin, max_bytes: int | None) -> bool:
     from retwin.cases import LogReader
 
     reader = LogReader(max_bytes=max_bytes)
-    commands = set(twin.inputs.names) <= set(reader.signals(file))
-    return commands and bool(reader.measured_outputs([file], twin))
+    try:
+        commands = set(twin.inputs.names) <= set(reader.signals(file))
+        return commands and bool(reader.measured_outputs([file], twin))
+    except InputError:  # of a log that only a mapping can read, or none
+        return False
 
 
 def read_signals(files: Sequence[Path], max_bytes: int | None = None) -> Trajectories:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from datetime import datetime
 from decimal import Decimal
@@ -176,7 +177,7 @@ def _parse(cells: NDArray, form: str, where: str) -> NDArray:
     """
     texts = [str(each).strip() for each in cells]
     if not form and texts and _time(texts[0], "") is None:
-        plain = [each.replace(", ", " ") for each in texts]
+        plain = [re.sub(r",(?=\d+$)", ".", each.replace(", ", " ")) for each in texts]
         forms = [f"{date} {hour}" for date in DATES for hour in HOURS]
         fitting = [own for own in forms if None not in (_time(text, own) for text in plain)]
         if len(fitting) > 1:
@@ -187,7 +188,7 @@ def _parse(cells: NDArray, form: str, where: str) -> NDArray:
     for row, text in enumerate(texts):
         time = _time(text, form)
         if time is None:
-            raise _no_time(text, f"{where}, row {row}")
+            raise _no_time(text, f"{where}, row {row}", form)
         made[row] = nanoseconds(time)
     return made
 
@@ -200,11 +201,13 @@ def _time(text: str, form: str) -> datetime | None:
         return None
 
 
-def _no_time(cell: object, where: str) -> InputError:
+def _no_time(cell: object, where: str, form: str = "") -> InputError:
     return InputError(
         where,
-        expected="times: numbers, ISO 8601, or text in the format that a mapping states",
+        expected=f"times in the format {form!r}"
+        if form
+        else "times: numbers, ISO 8601, or text in the format that a mapping states",
         got=repr(str(cell))[:60],
         remedy="repair or remove that row, name column and unit, or give "
-        'format = "%d.%m.%Y %H:%M:%S" in [time] of a mapping',
+        'format = "%d.%m.%Y %H:%M:%S,%f", or another, in [time] of a mapping',
     )

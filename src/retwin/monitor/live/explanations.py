@@ -240,4 +240,5 @@ def _data(cause: Cause, first: int) -> dict[str, Any]:
     size = [each if np.isfinite(each) else None for each in cause.size]
     onset = [first + round(each * SECOND) if np.isfinite(each) else None for each in cause.onset]
     shares = cause.probability, cause.unknown, cause.probabilities
-    return cause_data(cause.name, *shares, size, cause.unit, onset) | {"same": cause.same}
+    data = cause_data(cause.name, *shares, size, cause.unit, onset, limit=cause.limit)
+    return data | {"same": cause.same}

@@ -16,7 +16,7 @@ from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.inversion.fault_evidence import FaultEvidence
 from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.monitor.models.watched import Alarm
-from retwin.twins.faults.actuator_faults import Fault
+from retwin.twins.faults.actuator_faults import Fault, ends_of
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
     ParameterDrift,
@@ -44,6 +44,9 @@ EVENT = 500
 """Samples of an event that are looked at, at most, to tell whether a second fault began in it."""
 GROWTH = 0.25
 """Share of its age by which an event is older when its cause is inferred again."""
+
+AT_LIMIT = 0.02
+"""Share of the range of a fault's size within which its interval is at an end of it."""
 
 PARTS = ("value", "low", "high")
 """Of an estimate."""
@@ -74,6 +77,8 @@ class Cause:
         one of the event, or a further one.
     unit : str
         Of the size; "" where it has none.
+    limit : bool
+        Whether the size is at an end of the range in which it was searched.
 
     """
 
@@ -86,6 +91,7 @@ class Cause:
     probabilities: dict[str, float]
     same: bool = False
     unit: str = ""
+    limit: bool = False
 
 
 def cause_title(name: str) -> str:
@@ -104,7 +110,8 @@ def cause_text(cause: Mapping[str, Any], since: str) -> str:
     value, low, high = cause["size"]
     of = f" {cause['unit']}" if cause["unit"] not in ("", "1") else ""
     known = value is not None and np.isfinite(value)
-    size = f"size {value:.3g}{of} ({low:.3g} to {high:.3g}), " if known else ""
+    end = " at the end of its range" if cause["limit"] else ""
+    size = f"size {value:.3g}{of} ({low:.3g} to {high:.3g}){end}, " if known else ""
     among = " among the known causes" if more else ""
     return f"{text}; {size}probability {cause['probability']:.2f}{among}"
 
@@ -130,6 +137,8 @@ def cause_data(
     size: Sequence[float | None] = (None,) * 3,
     unit: str = "",
     onset: Sequence[float | None] = (None,) * 3,
+    *,
+    limit: bool = False,
 ) -> dict[str, Any]:
     """A cause as data of the log, None where there is no number; see `Cause`.
 
@@ -141,6 +150,7 @@ def cause_data(
         "unknown": unknown,
         "size": list(size),
         "unit": unit,
+        "limit": limit,
         "onset": list(onset),
         "probabilities": dict(probabilities),
     }
@@ -179,9 +189,12 @@ def possible_causes(
 def _any_change(twin: DynamicsTwin) -> dict[str, TimedFault]:
     """Any change of parameters, commands and sensors that the twin can simulate."""
     made: dict[str, TimedFault] = {}
-    present = dict(zip(twin.equations.names, twin.values.tolist(), strict=True))
+    names = twin.equations.names
+    present = dict(zip(names, twin.values.tolist(), strict=True))
+    fixed = {names[place] for _, place in twin.equations.delay_places}  # dead times do not change
     for each in twin.equations.parameters:
-        if each.name.isidentifier():  # those of the discrepancy have names of several words
+        # Those of the discrepancy have names of several words.
+        if each.name.isidentifier() and each.name not in fixed:
             value = min(max(present[each.name], each.low), each.high)
             size = (each.low - value, each.high - value)
             made[f"{each.name} changed"] = ParameterShift(parameter=each.name, size=size)
@@ -379,7 +392,18 @@ def _infer(
         (begin + onset[0], begin + onset[1], begin + onset[2]),
         dict(zip(made.classes, made.probabilities[0].tolist(), strict=True)),
         unit=size_unit(faults[made.classes[best]], twin),
+        limit=_at_limit(faults[made.classes[best]], interval(made.size)),
     )
+
+
+def _at_limit(fault: Fault | None, size: tuple[float, float, float]) -> bool:
+    """Whether the interval of a size reaches an end of the range of the fault, other than 0."""
+    if not isinstance(fault, SizedFault):
+        return False
+    ends = np.array(ends_of(fault.size))
+    margin = AT_LIMIT * np.ptp(ends)
+    reached = np.abs(np.array(size)[1:] - ends) <= margin
+    return bool((reached & (np.abs(ends) > margin)).any())
 
 
 def _better(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
+from retwin.monitor.models.cause import size_unit
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.visible import SHARE, Visible
 from retwin.progress import Progress
@@ -85,7 +86,8 @@ def visible_sizes(
             if now >= SHARE:
                 best, share = size, now
         if np.isfinite(share):  # of a fault that the twin can simulate
-            made.append(Visible(name, best, largest, share, within))
+            unit = size_unit(fault, monitor.twin)
+            made.append(Visible(name, best, largest, share, within, unit))
     return made
 
 

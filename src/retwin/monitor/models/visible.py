@@ -25,6 +25,8 @@ class Visible:
         Share of onsets with an alarm in time: at `size`, or else at the largest one.
     within : float
         That time in s.
+    unit : str
+        Of the sizes; "" where there are none.
 
     """
 
@@ -33,11 +35,17 @@ class Visible:
     largest: float | None
     share: float
     within: float
+    unit: str = ""
 
     def __str__(self) -> str:
         """One line for the terminal."""
+        of = f" {self.unit}" if self.unit not in ("", "1") else ""
         if self.share < SHARE:
-            what = "not seen" if self.largest is None else f"not seen up to {abs(self.largest):.3g}"
+            what = (
+                "not seen"
+                if self.largest is None
+                else f"not seen up to {abs(self.largest):.3g}{of}"
+            )
         else:
-            what = "seen" if self.size is None else f"seen from {abs(self.size):.3g} on"
+            what = "seen" if self.size is None else f"seen from {abs(self.size):.3g}{of} on"
         return f"{self.fault}: {what} ({self.share:.0%} within {self.within:.3g} s)"

@@ -114,8 +114,8 @@
     : `${fault(alarm.cause.name)} (${percent(alarm.cause.probability)})`;
   // An alarm whose samples a healthy machine explains best has no known cause.
   const fault = (name) => name === "Healthy" ? "no known fault" : name;
-  const interval = ([value, low, high], unit = "") => value == null ? ["–"]
-    : [`${digits(value)} ${unit}`, `90 % interval ${digits(low)} to ${digits(high)}`];
+  const interval = ([value, low, high], unit = "", limit = false) => value == null ? ["–"]
+    : [`${digits(value)} ${unit}`, `90 % interval ${digits(low)} to ${digits(high)}${limit ? ", at the end of its range" : ""}`];
 
   // The list of machines. Rows stay, so that the focus does; they move only while none has it.
   const fleet = () => {
@@ -394,7 +394,7 @@
         verdict("alarm", `Event since ${stamp(found.time)}${course(found)}; ${found.output}: ${found.change}. The twin of the healthy machine does not explain it.`,
           h("a", { href: to("asset", found.asset) }, "See the machine now")),
         facts(found.begin ? ["Trajectory", stamp(found.begin), `to ${clock(found.time)}`] : ["Began", why && why.onset[0] != null ? stamp(why.onset[0]) : "–", why && why.onset[1] != null && `90 % interval ${clock(why.onset[1])} to ${clock(why.onset[2])}`],
-          ...(found.begin ? [] : [["Size", ...(why ? interval(why.size, why.unit) : ["–"])]]),
+          ...(found.begin ? [] : [["Size", ...(why ? interval(why.size, why.unit, why.limit) : ["–"])]]),
           ["Evidence", digits(found.evidence), `alarm from ${digits(found.arl)} on`],
           ["Version of the twin", `${found.version}`]),
         h("h2", {}, "What to check"),
