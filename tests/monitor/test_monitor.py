@@ -373,6 +373,15 @@ def test_causes_are_any_change_where_no_faults_are_known(
     assert [*possible_causes(monitor.twin, known)] == ["Healthy", "leak"]
 
 
+def test_a_dead_time_is_no_cause() -> None:
+    late = Parameter("late", "s", 0.0, 0.5, 0.2)
+    delayed = replace(TANK, parameters=(*TANK.parameters, late), delays={"pump": "late"})
+    twin = fit_dynamics(delayed, record(1, 0), Dynamics(Library(0, (), False))).twin
+    names = [*possible_causes(twin)]
+    assert "drain changed" in names
+    assert not any(each.startswith("late") for each in names)
+
+
 def test_a_filter_that_diverges_voids_the_promise_and_begins_anew(monitor: Monitor) -> None:
     whole = record(2, 3)
     commands = whole.commands.astype(float).copy()

@@ -480,6 +480,17 @@ LEAK = ParameterShift("drain", size=(0.1, 1.0), onset=(0.0, 5.0))
 PUMP = replace(LEAK, parameter="other")
 
 
+def test_a_size_at_an_end_of_its_range_is_told() -> None:
+    margin = cause.AT_LIMIT * 0.9
+    for low, high, there in ((0.5, 1 - 0.9 * margin, True), (0.5, 1 - 1.1 * margin, False)):
+        assert cause._at_limit(LEAK, (0.7, low, high)) is there
+    assert cause._at_limit(LEAK, (0.2, 0.1 + 0.9 * margin, 0.3))
+    none = replace(LEAK, size=(0.0, 1.0))  # no change is the end of the fault, and not of its range
+    assert not cause._at_limit(none, (0.1, 0.0, 0.2))
+    data = cause_data("leak", 0.9, 0.1, {}, (0.9, 0.8, 1.0), "m2", limit=True)
+    assert "(0.8 to 1) at the end of its range, probability" in cause_text(data, "")
+
+
 def found_cause(
     monkeypatch: pytest.MonkeyPatch,
     name: str,
