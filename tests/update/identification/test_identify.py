@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from toys import AFFINE, LAG, LINE, PRODUCT, commands, lag, measured, parametric
+from toys import AFFINE, LAG, LINE, PRODUCT, commands, lag, line, measured, parametric
 
 import retwin as rt
 from retwin.cases.armpi_fpv.parameters import armpi_parametric
@@ -148,6 +148,23 @@ def test_a_product_of_two_parameters_is_not_identified() -> None:
     assert updated.values["a"] * updated.values["b"] == pytest.approx(1.08, abs=0.03)
     assert np.isinf(updated.errors["a"])
     assert "not identified" in updated.reason
+
+
+@pytest.mark.parametrize("effect", [0.0, 1e-6, 1e-3])
+def test_a_parameter_that_hardly_changes_the_outputs_keeps_its_value(effect: float) -> None:
+    def decayed(commands: np.ndarray, a: float, b: float, start: float) -> np.ndarray:
+        # What is left of a start when the first measurement is used.
+        return (
+            line(commands, a, b) + effect * start * np.exp(-np.arange(commands.shape[-2]))[:, None]
+        )
+
+    twin = parametric(decayed, a=(-3.0, 5.0), b=(-4.0, 4.0), start=(0.0, 4.0))
+    observed = measured(twin, 0.05, seed=3, a=1.2, b=0.9, start=3.0)
+    with pytest.warns(UserWarning, match="not identified: start"):
+        updated = identify(twin, observed, seed=0, method=LeastSquares(starts=4))
+    assert updated.values["start"] == twin.values[2] == 2.0
+    assert updated.values["a"] == pytest.approx(1.2, abs=0.05)
+    assert not updated.identifiability.at_bound.any()
 
 
 def test_a_best_value_on_a_bound_is_reported() -> None:

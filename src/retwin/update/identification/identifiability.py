@@ -77,17 +77,6 @@ class Identifiability:
     white: NDArray
 
     @property
-    def effects(self) -> NDArray:
-        """(k,), norms of the derivatives of the residuals by a parameter, over the largest; 0 for
-        one without effect.
-        """
-        # Of exact measurements, singular values over the noise are too large to be squared.
-        size = self.singular_values / (float(self.singular_values.max(initial=0.0)) or 1.0)
-        norms = np.linalg.norm(size[:, None] * self.directions, axis=0)
-        largest = float(norms.max(initial=0.0))
-        return np.where(norms > RANK_TOLERANCE * largest, norms, 0.0) / (largest or 1.0)
-
-    @property
     def warning(self) -> str:
         """The parameters that are not identified or lie on a bound; "" if there are none."""
         parts = []

@@ -27,6 +27,7 @@ from retwin.update.identification.horizon import Candidate, choose_length, lasti
 from retwin.update.identification.identifiability import (
     CHI2_95,
     MIN_TRAJECTORIES,
+    RANK_TOLERANCE,
     Identifiability,
     identifiability,
     noise_of,
@@ -44,6 +45,7 @@ from retwin.update.identification.search import (
     Optimum,
     Search,
 )
+from retwin.update.score_covariance import variance_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,16 +299,15 @@ def _fit(
     """The parameters that fit best; `missing` describes outputs that were never measured."""
     twin, search = misfit.twin, Search(misfit, method, progress)
     optima = search.run(np.random.default_rng(misfit.seed))
-    best, point = optima[0]
+    best, point = optima[0] = _hold_idle(search, *optima[0])
     residual = misfit.residuals(np.array([best.values]))[0]
     once = distinct_records(np.where(misfit.seen, misfit.measured, np.nan))
     found, errors, agreeing = _identifiability(search, optima, point, residual, once)
-    # Starts draw all parameters; one without effect has no other value than the present one.
-    values = np.where(found.effects > 0, best.values, twin.values)
+    values = np.array(best.values)
     if misfit.windows is not None:
         values = misfit.windows.with_starts(values)
     best = replace(best, values=tuple(values.tolist()))
-    optima = [(best, point), *optima[1:]]
+    optima[0] = best, point
     count = len(once)
     half = stats.t.ppf(0.975, max(count - 1, 1)) * errors
     unknown = ""
@@ -337,6 +338,26 @@ def _fit(
         loss=search.loss,
         scale=search.scale,
     )
+
+
+def _hold_idle(search: Search, best: Optimum, point: NDArray) -> tuple[Optimum, NDArray]:
+    """An optimum at which parameters that hardly change the outputs have their present values.
+
+    Starts draw all parameters. Hardly is, to first order and from one bound to the other, by less
+    in all samples together than the standard deviation of one residual.
+    """
+    misfit = search.misfit
+    residual = misfit.residuals(np.array([best.values]))[0]
+    noise = variance_of(residual, int(misfit.seen.sum()), len(point))
+    change = np.square(search.jacobian(point)).sum(axis=0)
+    idle = change <= max(noise, RANK_TOLERANCE**2 * change.max(initial=0.0))
+    present = np.array(misfit.twin.values)
+    held = np.where(idle, (present - misfit.low) / search.width, point)
+    values = np.where(idle, present, best.values)
+    more = np.sum(misfit.residuals(values[None]) ** 2) - np.sum(residual**2)
+    if not idle.any() or not more <= noise:
+        return best, point
+    return replace(best, values=tuple(values.tolist())), held
 
 
 def _identifiability(
