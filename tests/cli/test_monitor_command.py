@@ -62,6 +62,10 @@ def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:
     for more, text in (((later,), "0.25"), ((beside,), "0.2 "), ((within,), "0.2 ")):
         (row,) = _event_rows(watched, [found, *more], 1.0)  # type: ignore[arg-type]
         assert row[-1].startswith(f"leaking from 2 s; size {text.strip()} 1/s")
+    remark = SimpleNamespace(events=[replace(first, promised=False)], endings=[])
+    (row,) = _event_rows(remark, [found], 1.0)  # type: ignore[arg-type]
+    assert row[-2].startswith("remark: ")
+    assert row[-1].startswith("if it is a fault: leaking from 2 s")
     second = replace(within, name="weak pump", size=(-0.5, -0.6, -0.4), unit="", same=False)
     (row,) = _event_rows(watched, [found, second], 1.0)  # type: ignore[arg-type]
     assert row[-1].endswith(

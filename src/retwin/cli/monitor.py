@@ -438,6 +438,8 @@ def _event_rows(
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
         begin, texts = f"{first.time:.6g}", "; then ".join(map(text, named))
+        if named and not first.promised:
+            texts = f"if it is a fault: {texts}"
         rows.append((first.trajectory, begin, until, what, texts))
     return rows
 

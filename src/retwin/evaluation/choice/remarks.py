@@ -117,11 +117,13 @@ def _of_twin(
         delay, share = _dead_time(y, x)
         if share >= explained and abs(delay) >= 0.5:
             seconds = delay / records.rate
-            what = f"A dead time of {seconds:.3g} s"
+            what, remedy = f"A dead time of {seconds:.3g} s", ", which a StateTwin has by `delays`"
             if delay < 0:
                 what = f"The twin responds too late: an output that comes {-seconds:.3g} s earlier"
+                remedy = ""
             made.append(
-                f"{what} explains {share:.0%} of the mean square error of the twin in {output}."
+                f"{what} explains {share:.0%} of the mean square error of the twin in {output}"
+                f"{remedy}."
             )
     return made
 

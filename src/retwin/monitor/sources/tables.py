@@ -97,7 +97,10 @@ class Layout:
             odd &= good
             found[name] = Signal(name, every, numbers, table.units[name] if self.channels else "")
             if self.channels and odd.any():
-                bad.append(f"{odd.sum()} values of {name} in {table.place} that are no numbers")
+                bad.append(
+                    f"{odd.sum()} of the values of {name} in {table.place}, which are no numbers; "
+                    "all others are used"
+                )
             elif odd.any():
                 text = table.cells(name)[odd].tolist()
                 bad += [f"{str(each)[:80]!r} in {table.place}, column {name!r}" for each in text]

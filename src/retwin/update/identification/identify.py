@@ -27,6 +27,7 @@ from retwin.update.identification.horizon import Candidate, choose_length, lasti
 from retwin.update.identification.identifiability import (
     CHI2_95,
     MIN_TRAJECTORIES,
+    NEGLIGIBLE,
     RANK_TOLERANCE,
     Identifiability,
     identifiability,
@@ -344,13 +345,15 @@ def _hold_idle(search: Search, best: Optimum, point: NDArray) -> tuple[Optimum, 
     """An optimum at which parameters that hardly change the outputs have their present values.
 
     Starts draw all parameters. Hardly is, to first order and from one bound to the other, by less
-    in all samples together than the standard deviation of one residual.
+    in all samples together than the standard deviation of one residual, and than a hundredth of
+    what another parameter changes: a twin may be far too small for what was measured.
     """
     misfit = search.misfit
     residual = misfit.residuals(np.array([best.values]))[0]
     noise = variance_of(residual, int(misfit.seen.sum()), len(point))
     change = np.square(search.jacobian(point)).sum(axis=0)
-    idle = change <= max(noise, RANK_TOLERANCE**2 * change.max(initial=0.0))
+    largest = change.max(initial=0.0)
+    idle = change <= max(min(noise, NEGLIGIBLE**2 * largest), RANK_TOLERANCE**2 * largest)
     present = np.array(misfit.twin.values)
     held = np.where(idle, (present - misfit.low) / search.width, point)
     values = np.where(idle, present, best.values)

@@ -148,8 +148,8 @@
         : verdict(bad.length ? "alarm" : unsure.length ? "wait" : "ok",
           bad.length ? `${bad.length} of ${counted(assets.length, "machine")} ${bad.length === 1 ? "has an alarm" : "have alarms"} that nobody has acknowledged.`
             : `No open alarm in ${counted(assets.length, "machine")}.`,
-          unsure.length ? `${counted(unsure.length, "machine needs", "machines need")} attention: see the column State.`
-            : bad.length ? "All others do what their twins predict." : "All do what their twins predict."));
+          ...(unsure.length ? [`${counted(unsure.length, "machine needs", "machines need")} attention: see the column State.`]
+            : bad.length === assets.length ? [] : [`${bad.length ? "All others" : "All"} do what their twins predict.`])));
       const listed = found.slice(0, SHOWN);
       for (const asset of listed) {
         if (!rows.has(asset.asset)) rows.set(asset.asset, row(asset.asset));
