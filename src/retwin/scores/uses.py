@@ -133,14 +133,6 @@ def _is_plain(name: str) -> bool:
     return SOURCES[name].role == "plain"
 
 
-def updated_source(results: Results) -> str:
-    """The updated twin whose predictions stand beside the test trajectories, else the last one."""
-    if results.overlay is not None:
-        return results.overlay.source
-    names = [n for n in SOURCES if n in results.sources and SOURCES[n].role == "updated"]
-    return names[-1] if names else ""
-
-
 # ---- simulate
 
 
