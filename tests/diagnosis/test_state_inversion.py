@@ -6,6 +6,7 @@ The emulated box has a nonlinear loss, which its twin lacks.
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from test_readme import python_of
 
 import retwin as rt
 from retwin.diagnosis import StateDiagnosis, StateInversionDiagnoser
+from retwin.diagnosis.inversion.fault_evidence import FaultEvidence
 from retwin.errors import InputError
 from retwin.twins import (
     ActuatorGain,
@@ -265,3 +267,17 @@ def test_the_page_of_faults() -> None:
     assert np.diag(found.probabilities).min() > 0.9
     assert (found.unknown < 0.5).all()
     assert len(drawn) == len(found.classes)
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_a_sensor_at_rest_that_has_its_noise_is_not_frozen(frozen: bool) -> None:
+    """The noise of the twin contains what it lacks, and is much larger than that of the sensor."""
+    count = 100
+    sensor = np.full(count, 0.3) if frozen else np.random.default_rng(3).normal(0.3, 0.05, count)
+    record = SimpleNamespace(measured=sensor[:, None], seen=np.ones((count, 1), dtype=bool))
+    evidence = SimpleNamespace(record=record, twin=SimpleNamespace(noise=np.array([1.0])))
+    active, seen = np.ones(count, dtype=bool), record.seen.copy()
+    found = FaultEvidence._density_frozen(evidence, 0, active, seen)  # type: ignore[arg-type]
+    exact = -0.5 * (count - 1) * np.log(2 * np.pi)  # of a twin that predicts each sample exactly
+    assert abs(found - exact) > 10
+    assert (found > exact) == frozen

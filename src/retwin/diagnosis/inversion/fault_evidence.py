@@ -33,8 +33,10 @@ from retwin.update.dynamics.filter.prediction import root_of, whitened
 LEVELS = (0.03, 0.1, 0.3, 1.0)
 """Standard deviations of what is unknown: of process noise per sample, in usual steps of a state,
 or of measurement noise, in standard deviations of an output in the record."""
-FROZEN = np.array([1.0, 1e-2, 1e-4])
-"""Standard deviations of a sensor that is frozen, in those of its noise in calibration."""
+FROZEN = np.array([1e-2, 1e-4])
+"""Standard deviations of a sensor that is frozen, in those of its noise in calibration. With all of
+that noise it would be the last sample that is held, which predicts a machine at rest better than a
+twin whose noise contains what it lacks."""
 SMALLEST = 0.1
 """Smallest effect of parameters that counts: a change of the log density by 0.005 nats."""
 ROWS = 256
