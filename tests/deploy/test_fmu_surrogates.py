@@ -88,7 +88,7 @@ def corrected(
         for name in ("shift", "trust", "persistence"):
             getattr(made, name).uniform_()
         made.bounds.uniform_(2.0, 3.0)
-        made.spread.fill_(1.3)
+        made.spread.uniform_(1.0, 2.0)
         for each in made.members.parameters():
             each.mul_(2.0)
     return rt.CorrectedTwin(of, made.eval())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -229,6 +230,31 @@ def test_a_saved_model_predicts_the_same(tmp_path: Path, method: str) -> None:
         one, other = (predict_records(m, data, horizon=horizon) for m in (found.twin, again))
         np.testing.assert_allclose(one.mean, other.mean, atol=1e-6)
         np.testing.assert_allclose(one.deviation, other.deviation, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_bands_of_two_outputs_hold_of_another_record_after_they_are_saved(tmp_path: Path) -> None:
+    both = rt.Channels(("heat", "signal"), ("K", "V"))
+    twin = replace(twin_of(), output=lambda x, u, p: (x.heat, 5 * x.heat), outputs=both)
+
+    def with_signal(*seeds: int) -> rt.Trajectories:
+        data = records(*seeds, slope=radiating)
+        noise = 0.5 * np.random.default_rng(seeds[0]).normal(size=data.observed.shape)
+        observed = np.concatenate([data.observed, 5 * data.observed + noise], axis=2)
+        seen = np.ones(observed.shape, dtype=bool)
+        return data.replace(observed=observed, nominal=observed, mask=seen, outputs=both)
+
+    settings = rt.Choice(candidates=("none", "output"), method="output", yardstick=False)
+    found = rt.fit(twin, with_signal(0, 1), settings)
+    found.save(tmp_path / "model")
+    test, again = with_signal(2, 3), rt.load_twin(tmp_path / "model")
+    made = predict_records(again, test)
+    kept = predict_records(found.twin, test)
+    np.testing.assert_allclose(made.deviation, kept.deviation, rtol=1e-6)
+    inside = np.abs(test.observed - made.mean) < 1.645 * made.deviation
+    assert (inside.mean(axis=(0, 1)) > 0.85).all()
+    relative = made.deviation.mean(axis=(0, 1)) / (test.observed - made.mean).std(axis=(0, 1))
+    assert (relative < 2).all()
 
 
 def test_no_band_is_given_where_commands_leave_the_range_of_the_calibration() -> None:

@@ -146,6 +146,22 @@ def test_trust_shrinks_the_mean_and_leaves_the_shape() -> None:
     torch.testing.assert_close(half.variance, mixture.variance)
 
 
+def test_each_output_is_widened_by_its_own_factor(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    channels = rt.Channels(("u",), ("1",)), rt.Channels(("y", "w"), ("1", "m"))
+    rg = SequenceResidual(Additive(), SMALL, inputs=channels[0], outputs=channels[1]).eval()
+    features = torch.randn(2, 40, 3)
+    with torch.no_grad():
+        before = rg.distributions(features)[0]
+        rg.spread.copy_(torch.tensor([2.0, 5.0]))
+        after = rg.distributions(features)[0]
+    assert before.factor[..., 1, 0].abs().max() > 1e-3, "outputs that are correlated"
+    ratio = after.component_distribution.stddev / before.component_distribution.stddev
+    torch.testing.assert_close(ratio, rg.spread.expand_as(ratio))
+    rg.save(tmp_path / "rg")
+    torch.testing.assert_close(load_residual(tmp_path / "rg").spread, rg.spread)
+
+
 def test_without_persistence_draws_are_white(twin: rt.Surrogate, record: rt.Trajectories) -> None:
     quick = replace(
         SMALL,

@@ -134,7 +134,7 @@ static void predict(int member, const double *in, double *memory, int first, Mix
                 double value = j > i ? 0.0 : *lower++;
                 if (i == j)
                     value = FLOOR + (value > 20.0 ? value : log1p(exp(value)));
-                made->factor[k][i][j] = SPREAD * SCALE[i] * value;
+                made->factor[k][i][j] = SPREAD[i] * SCALE[i] * value;
             }
         }
     }

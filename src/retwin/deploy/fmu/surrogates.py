@@ -156,7 +156,7 @@ def _residual_parts(residual: SequenceResidual) -> tuple[CNetwork, list[str]]:
     weights = [_member_weights(density.network, each) for each in residual.members]
     sizes = {"MEMBERS": len(weights), "PER_MEMBER": len(weights[0]), "ENCODED": encoder.memory}
     sizes |= {"FEATURES": density.features, "COMPONENTS": density.components}
-    numbers = {"FLOOR": FLOOR, "SPREAD": float(residual.spread), "SQRT2": float(np.sqrt(2.0))}
+    numbers = {"FLOOR": FLOOR, "SQRT2": float(np.sqrt(2.0))}
     persistence = flat(residual.persistence)
     defined = "".join(f"#define {name} {value!r}\n" for name, value in (sizes | numbers).items())
     return encoder, [
@@ -167,6 +167,7 @@ def _residual_parts(residual: SequenceResidual) -> tuple[CNetwork, list[str]]:
         constants("SHIFT", flat(residual.shift)),
         constants("SCALE", flat(residual.scale)),
         constants("TRUST", flat(residual.trust)),
+        constants("SPREAD", flat(residual.spread)),
         constants("LIMIT", flat(residual.bounds)),
         constants("PERSISTENCE", np.concatenate([persistence[:1], persistence])),
     ]

@@ -155,7 +155,7 @@ class SequenceResidual(Residual[SequenceMixture]):
     trust : Tensor
         (d_z,), factor from 0 to 1 by which means are shrunk towards `shift`.
     spread : Tensor
-        Factor by which standard deviations are multiplied.
+        (d_z,), factor by which standard deviations are multiplied.
 
     Raises
     ------
@@ -180,7 +180,7 @@ class SequenceResidual(Residual[SequenceMixture]):
         self.before = Standardise(len(self.inputs) + len(self.outputs))
         self.members = self.fresh()
         self.trust = nn.Buffer(torch.ones(len(self.latent)))
-        self.spread = nn.Buffer(torch.ones(()))
+        self.spread = nn.Buffer(torch.ones(len(self.latent)))
 
     def fresh(self) -> nn.ModuleList:
         """Members with random initial weights."""
@@ -195,8 +195,9 @@ class SequenceResidual(Residual[SequenceMixture]):
 
     def distributions(self, features: Tensor) -> list[GaussianMixture]:
         """The calibrated distribution (K, n, T) of each block for the past (n, T, F), by member."""
-        shift, trust = self.shift.split(self.sizes), self.trust.split(self.sizes)
-        return widened(shrunk(self.predict(features), shift, trust), self.spread)
+        parts = (each.split(self.sizes) for each in (self.shift, self.trust, self.spread))
+        shift, trust, spread = parts
+        return widened(shrunk(self.predict(features), shift, trust), spread)
 
     def predict(self, features: Tensor) -> list[GaussianMixture]:
         """What K members predict for each block, (K, n, T), before calibration.
@@ -253,11 +254,13 @@ def shrunk(
     return moved
 
 
-def widened(blocks: Sequence[GaussianMixture], spread: Tensor | float) -> list[GaussianMixture]:
-    """The mixtures with the standard deviations of all components multiplied by `spread`."""
+def widened(blocks: Sequence[GaussianMixture], spread: Sequence[Tensor]) -> list[GaussianMixture]:
+    """The mixtures with the standard deviations of all components multiplied by `spread` (d,)."""
     return [
-        GaussianMixture(block.mixture_distribution.logits, block.means, spread * block.factor)
-        for block in blocks
+        GaussianMixture(
+            block.mixture_distribution.logits, block.means, factor[:, None] * block.factor
+        )
+        for block, factor in zip(blocks, spread, strict=True)
     ]
 
 
