@@ -29,6 +29,7 @@ from retwin.twins.faults.system_faults import (
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.filter.likelihood import NoiseVariances, Record, Variants
 from retwin.update.dynamics.filter.prediction import root_of, whitened
+from retwin.update.identification.identifiability import correlation_time
 
 LEVELS = (0.03, 0.1, 0.3, 1.0)
 """Standard deviations of what is unknown: of process noise per sample, in usual steps of a state,
@@ -113,8 +114,34 @@ class FaultEvidence:
             [not isinstance(fault, SizedFault), False, fault.end is None], dtype=bool
         )
         scale = np.array([1.0, rate, rate])
-        ends = (np.where(missing, np.nan, e / scale) for e in (found.low, found.mean, found.high))
-        return Integral(found.evidence, found.best, *ends)
+        low, mean, high = (
+            np.where(missing, np.nan, e / scale) for e in (found.low, found.mean, found.high)
+        )
+        if not missing[0] and np.isfinite(found.evidence):
+            more = self._error_inflation(fault, found.best)
+            low[0] = max(sizes[0], mean[0] - more * (mean[0] - low[0]))
+            high[0] = min(sizes[1], mean[0] + more * (high[0] - mean[0]))
+        return Integral(found.evidence, found.best, low, mean, high)
+
+    def _error_inflation(self, fault: TimedFault, point: NDArray) -> float:
+        """By how much a size is more uncertain than it would be if predictions were right.
+
+        It is the square root of the long-run variance of the standardised errors since the onset,
+        which are independent and of variance 1 where the twin with the fault lacks nothing.
+        """
+        variants, _ = self._inputs(fault, point[None])
+        measured, seen = (
+            getattr(self.record, name)[None] if made is None else made
+            for name, made in (("measured", variants.measured), ("seen", variants.seen))
+        )
+        mean, covariance, _ = self.record.filtered(variants)
+        errors = whitened(measured - mean, root_of(covariance, seen), seen)
+        used = seen & _active(point[None], len(self.record.commands))[..., None]
+        errors = np.where(used, errors, 0.0)
+        if not np.isfinite(errors).all() or not errors.any():
+            return 1.0
+        variance = np.sum(errors**2) / used.sum()
+        return float(np.sqrt(max(1.0, variance * correlation_time(errors))))
 
     def tolerated(
         self, fault: TimedFault | None, found: Integral, *, tolerance: float = 0.1
