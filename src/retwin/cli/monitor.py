@@ -485,8 +485,8 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     bound = duration(shortest(events, samples) / rate)
     shown = f"{duration(samples / rate)} shows {counted(events, 'event')}"
     return (
-        f"This replay of {shown}; if all was healthy, that alone bounds their rate at one in "
-        f"{bound} (exact 95 %). {_describe_promise(monitor)}"
+        f"This replay of {shown}; if the machine was healthy all the time, that alone bounds their "
+        f"rate at one in {bound} (exact 95 %). {_describe_promise(monitor)}"
     )
 
 

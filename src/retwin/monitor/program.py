@@ -76,7 +76,11 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
     """
     with ExitStack() as opened:
         page = settings.server
-        token = check_token(secret("token", page.token_env, page.token_file)) if page else ""
+        token = (
+            check_token(secret("token, of 16 characters at least", page.token_env, page.token_file))
+            if page
+            else ""
+        )
         bound = page and opened.enter_context(listening(page.host, page.port))
         for twin in settings.twins.values():
             load_monitor(twin.monitor)

@@ -275,6 +275,6 @@ def secret(what: str, env: str | None, file: Path | None = None) -> str | None:
     else:
         return None
     place = str(file or f"the variable {env}")
-    remedy = f"put the {what} there"
+    remedy = f"put the {what} there" + f", as in export {env}=…" * (file is None)
     require(value, place, expected=f"the {what}", got="nothing", remedy=remedy)
     return value

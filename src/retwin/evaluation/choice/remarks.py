@@ -34,8 +34,8 @@ def remarks_of(
     made = []
     if chosen != preferred:
         made.append(
-            f"The method was given ({by_name[chosen].title}); the comparison would have taken: "
-            f"{by_name[preferred].title}."
+            f"The method was given ({by_name[chosen].title}); of those that were compared, "
+            f"{by_name[preferred].title} would have been taken."
         )
     made += _worse_than_mean(records, by_name[chosen])
     if len(records) < RECORDS:

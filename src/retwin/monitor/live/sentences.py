@@ -45,5 +45,5 @@ def sentence(entry: Entry) -> str:
 
 def moment_text(time: int) -> str:
     """A time in ns, to the second."""
-    moment = datetime.fromtimestamp(time // SECOND, UTC)
+    moment = datetime.fromtimestamp(round(time / SECOND), UTC)
     return moment.isoformat().replace("+00:00", "Z")
