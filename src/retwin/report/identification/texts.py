@@ -56,8 +56,12 @@ def state(each: ParameterEstimate) -> str:
         return "depends on the bound of another parameter"
     if each.covered is None:
         return "not identified"
-    if each.covered <= WIDEST and not each.leaves:
-        return "not identified: other starts of the search fit as well elsewhere"
+    if each.covered <= WIDEST:
+        return (
+            "not shown to differ from an end of its range"
+            if each.leaves
+            else "not identified: other starts of the search fit as well elsewhere"
+        )
     leaves = " and leaves it" if each.leaves else ""
     return f"not identified: interval covers {_share(each.covered)} of the range{leaves}"
 
@@ -134,6 +138,7 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
     ]
     strong = [f"{a} and {b} ({signed(r, 2)})" for a, b, r in pairs if abs(r) > STRONG]
     means = {each.name: each.mean for each in found.outputs}
+    unknown = [p for p in found.parameters if not (p.identified or p.at_bound or p.depends)]
     measured = found.simulated["identification"][0]
     return sentences(
         "findings",
@@ -158,7 +163,8 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
         larger=[pair for pair in found.begin_errors.items() if pair[1] > ELSEWHERE],
         tenth=measured.lengths.max() / measured.rate / BEGIN,
         started=any(each.name.startswith("start_") for each in found.parameters),
-        unknown=[p for p in found.parameters if not (p.identified or p.at_bound or p.depends)],
+        unknown=unknown,
+        undetermined=[p for p in unknown if not (p.leaves and (p.covered or 0.0) <= WIDEST)],
         depending=[each.name for each in found.parameters if each.depends],
         strong=strong[:SENTENCES],
         coloured=_coloured(found),
