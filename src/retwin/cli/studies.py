@@ -36,7 +36,7 @@ DEMO_SETTINGS: Any = {
 """Settings of the plan of the demo."""
 DEMO_EPOCHS = 6
 """Epochs of the demo's surrogate, whose error is then a tenth of the discrepancy."""
-DEMO_MINUTES = 3
+DEMO_MINUTES = 2
 """Minutes that a run of the demo takes at most on two cores, as measured."""
 COMPARED = {"a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict"}
 """What is printed of a comparison as JSON."""
