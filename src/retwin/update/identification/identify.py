@@ -300,7 +300,7 @@ def _fit(
     """The parameters that fit best; `missing` describes outputs that were never measured."""
     twin, search = misfit.twin, Search(misfit, method, progress)
     optima = search.run(np.random.default_rng(misfit.seed))
-    best, point = optima[0] = _hold_idle(search, *optima[0])
+    best, point = optima[0] = _hold_insensitive(search, *optima[0])
     residual = misfit.residuals(np.array([best.values]))[0]
     once = distinct_records(np.where(misfit.seen, misfit.measured, np.nan))
     found, errors, agreeing = _identifiability(search, optima, point, residual, once)
@@ -341,7 +341,7 @@ def _fit(
     )
 
 
-def _hold_idle(search: Search, best: Optimum, point: NDArray) -> tuple[Optimum, NDArray]:
+def _hold_insensitive(search: Search, best: Optimum, point: NDArray) -> tuple[Optimum, NDArray]:
     """An optimum at which parameters that hardly change the outputs have their present values.
 
     Starts draw all parameters. Hardly is, to first order and from one bound to the other, by less
@@ -353,12 +353,12 @@ def _hold_idle(search: Search, best: Optimum, point: NDArray) -> tuple[Optimum, 
     noise = variance_of(residual, int(misfit.seen.sum()), len(point))
     change = np.square(search.jacobian(point)).sum(axis=0)
     largest = change.max(initial=0.0)
-    idle = change <= max(min(noise, NEGLIGIBLE**2 * largest), RANK_TOLERANCE**2 * largest)
+    insensitive = change <= max(min(noise, NEGLIGIBLE**2 * largest), RANK_TOLERANCE**2 * largest)
     present = np.array(misfit.twin.values)
-    held = np.where(idle, (present - misfit.low) / search.width, point)
-    values = np.where(idle, present, best.values)
+    held = np.where(insensitive, (present - misfit.low) / search.width, point)
+    values = np.where(insensitive, present, best.values)
     more = np.sum(misfit.residuals(values[None]) ** 2) - np.sum(residual**2)
-    if not idle.any() or not more <= noise:
+    if not insensitive.any() or not more <= noise:
         return best, point
     return replace(best, values=tuple(values.tolist())), held
 

@@ -244,15 +244,15 @@ def _calibrate(model: SequenceResidual, data: _Records, held_out: Tensor) -> dic
     model.trust.copy_(_trust(means[held_out] - model.shift, z - model.shift))
     predicted = shrunk(predicted, model.shift.split(model.sizes), model.trust.split(model.sizes))
 
-    def widened_by(spread: float) -> Blocks:
+    def widen(spread: float) -> Blocks:
         return Blocks(widened(predicted, torch.full_like(model.spread, spread).split(model.sizes)))
 
     def log_likelihood(spread: float) -> float:
-        return float(widened_by(spread).log_prob(data.z)[held_out].sum())
+        return float(widen(spread).log_prob(data.z)[held_out].sum())
 
     spread = max(SPREADS.tolist(), key=log_likelihood)
     model.spread.fill_(spread)
-    distribution = widened_by(spread)
+    distribution = widen(spread)
     scores = distribution.normal_scores(data.z.expand_as(means))
     if model.density.persistent:
         model.persistence.copy_(_persistence(scores, held_out))
