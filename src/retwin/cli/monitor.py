@@ -424,7 +424,7 @@ def _event_rows(
         return cause_text(vars(cause), "" if isnan(onset) else f"{onset:.6g} s")
 
     ends = {(each.trajectory, each.event): each for each in watched.endings}
-    rows = []
+    rows, before = [], dict[str, str]()
     for first in watched.events:
         named: list[Cause] = []
         for cause in causes:
@@ -438,6 +438,9 @@ def _event_rows(
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
         begin, texts = f"{first.time:.6g}", "; then ".join(map(text, named))
+        if named:  # a fault that lasts may not show for a while
+            texts = "again: " * (named[0].name == before.get(first.trajectory)) + texts
+            before[first.trajectory] = named[-1].name
         if named and not first.promised:
             texts = f"if it is a fault: {texts}"
         rows.append((first.trajectory, begin, until, what, texts))
