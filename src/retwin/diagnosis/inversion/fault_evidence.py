@@ -130,10 +130,7 @@ class FaultEvidence:
         which are independent and of variance 1 where the twin with the fault lacks nothing.
         """
         variants, _ = self._inputs(fault, point[None])
-        measured, seen = (
-            getattr(self.record, name)[None] if made is None else made
-            for name, made in (("measured", variants.measured), ("seen", variants.seen))
-        )
+        _, measured, seen, _ = self.record.inputs(variants)
         mean, covariance, _ = self.record.filtered(variants)
         errors = whitened(measured - mean, root_of(covariance, seen), seen)
         used = seen & _active(point[None], len(self.record.commands))[..., None]

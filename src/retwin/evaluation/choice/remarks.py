@@ -117,7 +117,10 @@ def _of_twin(
         delay, share = _dead_time(y, x)
         if share >= explained and abs(delay) >= 0.5:
             seconds = delay / records.rate
-            what, remedy = f"A dead time of {seconds:.3g} s", ", which a StateTwin has by `delays`"
+            what, remedy = (
+                f"A dead time of {seconds:.3g} s",
+                ", which a StateTwin states as delays={command: parameter}",
+            )
             if delay < 0:
                 what = f"The twin responds too late: an output that comes {-seconds:.3g} s earlier"
                 remedy = ""

@@ -197,7 +197,7 @@ class SequenceResidual(Residual[SequenceMixture]):
         """The calibrated distribution (K, n, T) of each block for the past (n, T, F), by member."""
         parts = (each.split(self.sizes) for each in (self.shift, self.trust, self.spread))
         shift, trust, spread = parts
-        return widened(shrunk(self.predict(features), shift, trust), spread)
+        return scale_deviations(shrunk(self.predict(features), shift, trust), spread)
 
     def predict(self, features: Tensor) -> list[GaussianMixture]:
         """What K members predict for each block, (K, n, T), before calibration.
@@ -254,7 +254,9 @@ def shrunk(
     return moved
 
 
-def widened(blocks: Sequence[GaussianMixture], spread: Sequence[Tensor]) -> list[GaussianMixture]:
+def scale_deviations(
+    blocks: Sequence[GaussianMixture], spread: Sequence[Tensor]
+) -> list[GaussianMixture]:
     """The mixtures with the standard deviations of all components multiplied by `spread` (d,)."""
     return [
         GaussianMixture(

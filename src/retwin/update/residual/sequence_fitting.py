@@ -27,8 +27,8 @@ from retwin.update.residual.sequence import (
     SequenceMixture,
     SequenceResidual,
     past,
+    scale_deviations,
     shrunk,
-    widened,
 )
 
 SPREADS = np.geomspace(0.5, 4.0, 85)
@@ -244,15 +244,17 @@ def _calibrate(model: SequenceResidual, data: _Records, held_out: Tensor) -> dic
     model.trust.copy_(_trust(means[held_out] - model.shift, z - model.shift))
     predicted = shrunk(predicted, model.shift.split(model.sizes), model.trust.split(model.sizes))
 
-    def widen(spread: float) -> Blocks:
-        return Blocks(widened(predicted, torch.full_like(model.spread, spread).split(model.sizes)))
+    def with_spread(spread: float) -> Blocks:
+        return Blocks(
+            scale_deviations(predicted, torch.full_like(model.spread, spread).split(model.sizes))
+        )
 
     def log_likelihood(spread: float) -> float:
-        return float(widen(spread).log_prob(data.z)[held_out].sum())
+        return float(with_spread(spread).log_prob(data.z)[held_out].sum())
 
     spread = max(SPREADS.tolist(), key=log_likelihood)
     model.spread.fill_(spread)
-    distribution = widen(spread)
+    distribution = with_spread(spread)
     scores = distribution.normal_scores(data.z.expand_as(means))
     if model.density.persistent:
         model.persistence.copy_(_persistence(scores, held_out))
