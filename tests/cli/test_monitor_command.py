@@ -65,7 +65,7 @@ def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:
     anew = replace(first, event=9, sample=9, time=9.0)
     both = SimpleNamespace(events=[first, anew], endings=[])
     same, other = replace(found, alarm=anew), replace(beside, alarm=anew, same=False)
-    for cause, said in ((same, "again: leaking from 2 s"), (other, "weak pump from 2 s")):
+    for cause, said in ((same, "again, or still: leaking from 2 s"), (other, "weak pump from 2 s")):
         rows = _event_rows(both, [found, cause], 1.0)  # type: ignore[arg-type]
         assert rows[0][-1].startswith("leaking")
         assert rows[1][-1].startswith(said)

@@ -10,6 +10,7 @@ import pytest
 import retwin as rt
 from retwin.errors import InputError
 from retwin.monitor.detect.detector import Detector
+from retwin.monitor.detect.events import FOLLOWS
 from retwin.monitor.detect.predictors import SLOWER, agreeing
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.models.cause import find_cause, find_causes, possible_causes
@@ -129,7 +130,7 @@ def test_an_event_lasts_until_the_twin_follows_again(monitor: Monitor) -> None:
     found = monitor.watch(pulse(40.0))
     (first,), (end,) = found.events, found.endings
     assert 30.0 < first.time < 33.0
-    assert (end.event, end.how) == (first.sample, "the twin follows again")
+    assert (end.event, end.how) == (first.sample, FOLLOWS)
     assert 40.0 < end.sample / RATE < 60.0
     assert all(each.event == first.sample for each in found.alarms)
     np.testing.assert_array_equal(

@@ -439,7 +439,7 @@ def _event_rows(
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
         begin, texts = f"{first.time:.6g}", "; then ".join(map(text, named))
         if named:  # a fault that lasts may not show for a while
-            texts = "again: " * (named[0].name == before.get(first.trajectory)) + texts
+            texts = "again, or still: " * (named[0].name == before.get(first.trajectory)) + texts
             before[first.trajectory] = named[-1].name
         if named and not first.promised:
             texts = f"if it is a fault: {texts}"

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FOLLOWS, CHANGED = "the twin follows again", "changed"
+FOLLOWS = "the twin follows again: the fault is over, or does not show now"
+CHANGED = "changed"
 """How an event ends."""
 CERTAIN = 0.05
 """Probability of more evidence than samples over this: for a change in a healthy machine, and for a

@@ -61,7 +61,7 @@ class Ending:
     event, sample : int
         Numbers of the sample of its first alarm, and of the one at which it ends.
     how : str
-        "the twin follows again", or "changed".
+        `FOLLOWS` or `CHANGED` of `retwin.monitor.detect.events`.
 
     """
 
