@@ -186,7 +186,11 @@ def test_models_without_the_twin_are_compared_on_the_same_parts(tmp_path: Path) 
     assert page.count("without the twin") > len(rivals)
     assert "retwin monitor fit model " in page
     known = rt.fit(twin_of(), records(0, slope=right), rt.Choice(candidates=FAST))
-    assert not any("lacks something" in each for each in with_yardstick(known).remarks)
+    alone, divided = (with_yardstick(known, workers=count) for count in (1, 2))
+    assert not any("lacks something" in each for each in alone.remarks)
+    assert [replace(each, seconds=0.0) for each in divided.scores] == [
+        replace(each, seconds=0.0) for each in alone.scores
+    ]
 
 
 def test_copies_of_a_record_count_once() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -181,7 +182,12 @@ def _carry_out(
         if yardstick:
             note(f"Saved {out}; now models without the twin, to be compared with")
             try:
-                found = with_yardstick(found, seed=seed, progress=lambda s: show("yardstick", s))
+                found = with_yardstick(
+                    found,
+                    seed=seed,
+                    workers=os.cpu_count() or 1,
+                    progress=lambda s: show("yardstick", s),
+                )
             except KeyboardInterrupt:
                 kept = f"{out} stays as it was saved, not compared with models without the twin"
                 raise Interrupted(kept) from None

@@ -290,7 +290,9 @@ def widened(model: Model, factors: NDArray, forecast: ForecastErrors) -> Model:
     return replace(model, forecast=forecast)
 
 
-def with_yardstick(found: Fitted, *, seed: int = 0, progress: Progress | None = None) -> Fitted:
+def with_yardstick(
+    found: Fitted, *, seed: int = 0, workers: int = 1, progress: Progress | None = None
+) -> Fitted:
     """The same, compared with models without the twin on the same parts.
 
     Parameters
@@ -299,18 +301,17 @@ def with_yardstick(found: Fitted, *, seed: int = 0, progress: Progress | None = 
         What `fit` returned.
     seed : int
         Of networks.
+    workers : int
+        The number of processes. A script that wants more than one is guarded by
+        `if __name__ == "__main__"`, since each of them imports it.
     progress : callable, optional
         Called with the share of the work that is done.
 
     """
     began, records = time.perf_counter(), found.records
-
-    def fits(training: Trajectories) -> dict[str, Callable[[], object]]:
-        made = partial(fit_black_box, training, members=MEMBERS, seed=seed)
-        return {kind: lambda kind=kind: made(kind).twin for kind in BLACK_BOXES}  # type: ignore[misc]
-
+    fits = partial(_black_boxes, seed)
     trials = Trials(records, folds_of(records), list(BLACK_BOXES), fits, progress)
-    trials.run()
+    trials.run(workers)
     comparison, reasons = trials.compare(found.horizon)
     behind = {kind: _behind(found, comparison, kind) for kind in comparison.predicted}
     rows = [
@@ -327,6 +328,15 @@ def with_yardstick(found: Fitted, *, seed: int = 0, progress: Progress | None = 
         remarks=(*found.remarks, *without_twin(rows, found.score(found.chosen))),
         seconds=found.seconds + time.perf_counter() - began,
     )
+
+
+def _black_boxes(seed: int, training: Trajectories) -> dict[str, Callable[[], Model]]:
+    """What fits each model without the twin to some records."""
+    return {kind: partial(_fit_black_box, training, kind, seed) for kind in BLACK_BOXES}
+
+
+def _fit_black_box(training: Trajectories, kind: str, seed: int) -> Model:
+    return fit_black_box(training, kind, members=MEMBERS, seed=seed).twin
 
 
 def _behind(found: Fitted, comparison: Comparison, kind: str) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ from retwin.evaluation.choice.comparison import Comparison, predict
 from retwin.evaluation.choice.folds import Fold
 from retwin.progress import Progress
 from retwin.twins.collected import SimulationError
+from retwin.workers.jobs import each
+from retwin.workers.threads import one_thread
 
 FAILURES = (InputError, SimulationError, RuntimeError, ArithmeticError, np.linalg.LinAlgError)
 """What ends a candidate, and not the comparison: refused records, diverging fits and trainings."""
@@ -56,35 +58,39 @@ class Trials:
     reasons: dict[str, str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def run(self) -> None:
-        """Fit all."""
-        total, done = len(self.names) * len(self.folds), 0
-        for fold in self.folds:
-            fits = self.fits(fold.training(self.records))
-            for name in self.names:
-                if name not in self.reasons:
-                    self._try(name, fits.get(name))
-                done += 1
-                if self.progress is not None:
-                    self.progress(done / total)
+    def run(self, workers: int = 1) -> None:
+        """Fit all, in this process or in so many others, to which `fits` is then sent."""
+        count, done = len(self.folds), 0
 
-    def _try(self, name: str, fit: Callable[[], Any] | None) -> None:
-        began = time.process_time()
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the final fit states them
-                if fit is None:
-                    raise InputError("records", expected="such records", got="none", remedy="")
-                self.models.setdefault(name, []).append(fit())
-        except FAILURES as error:
-            self.reasons[name] = str(error)
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.process_time() - began
+        def report(share: float) -> None:
+            if self.progress is not None:
+                self.progress((done + share) / count)
+
+        made: list[tuple[dict[str, Any], dict[str, str]]] = [({}, {})] * count
+        fits = each(
+            _fit_without,
+            replace(self, progress=None),  # a worker cannot send progress
+            range(count),
+            workers=min(workers, count),
+            scheduler=None,
+            progress=report,
+        )
+        for number, models, reasons, seconds in fits:
+            made[number], done = (models, reasons), done + 1
+            self.reasons.update(reasons)
+            for name, own in seconds.items():
+                self.seconds[name] = self.seconds.get(name, 0.0) + own
+            report(0.0)
+        for _, reasons in reversed(made):  # that of the first fold, whichever came first
+            self.reasons.update(reasons)
+        for name in self.names:
+            if name not in self.reasons:
+                self.models[name] = [models[name] for models, _ in made]
 
     def compare(self, horizon: float | None) -> tuple[Comparison, dict[str, str]]:
         """Of the models whose predictions stay finite, and why others have none."""
         records, reasons, predicted = self.records, dict(self.reasons), {}
-        for name in (each for each in self.names if each not in reasons):
+        for name in (own for own in self.names if own not in reasons):
             pairs = zip(self.models[name], self.folds, strict=True)
             try:
                 made = [predict(model, records, fold, horizon) for model, fold in pairs]
@@ -98,6 +104,29 @@ class Trials:
             else:
                 predicted[name] = made
         return Comparison(records, self.folds, predicted), reasons
+
+
+def _fit_without(
+    trials: Trials, number: int, progress: Progress = lambda _: None
+) -> tuple[int, dict[str, Any], dict[str, str], dict[str, float]]:
+    """The models without a fold by its number, why others failed, and the time of each in s."""
+    fits = trials.fits(trials.folds[number].training(trials.records))
+    models, reasons, seconds = dict[str, Any](), dict[str, str](), dict[str, float]()
+    for done, name in enumerate(trials.names, 1):
+        if name in trials.reasons:  # it failed without another fold
+            continue
+        began, fit = time.process_time(), fits.get(name)
+        try:
+            with one_thread(), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the final fit states them
+                if fit is None:
+                    raise InputError("records", expected="such records", got="none", remedy="")
+                models[name] = fit()
+        except FAILURES as error:
+            reasons[name] = str(error)
+        seconds[name] = time.process_time() - began
+        progress(done / len(trials.names))
+    return number, models, reasons, seconds
 
 
 def unstable(comparison: Comparison, whole: Candidates) -> bool:
