@@ -261,10 +261,10 @@ def test_what_invalidates_a_result_comes_first_and_each_file_is_named(place: Pat
     assert "physical values may lie outside" in table
     errors, first, *_ = rest.split("\n\n")[1].splitlines()
     assert "the RMS error of level" in errors
-    assert first.startswith("valve: constant in all logs")
-    assert out.count("constant in all logs") == 1
+    assert first.startswith("valve: constant in what was read")
+    assert out.count("constant in what was read") == 1
     page = Path("out/report.html").read_text("utf-8")
-    assert page.index("valve: constant in all logs") < page.index("not white noise (Ljung")
+    assert page.index("valve: constant in what was read") < page.index("not white noise (Ljung")
     assert page.count("physical values may lie outside") == 1
     assert "Saved out/logs.npz" in err
 

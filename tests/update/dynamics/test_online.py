@@ -11,6 +11,7 @@ import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
 from retwin.twins.compiled import steps
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
+from retwin.update.dynamics.filter import online
 from retwin.update.dynamics.filter.online import FilterState, OnlineFilter
 
 TWIN = StateTwin(
@@ -48,10 +49,10 @@ def stream(count: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return COMMANDS[:count, :60], np.where(seen, measured, np.nan), seen
 
 
-def passed(online: OnlineFilter, cuts: list[int]) -> list[np.ndarray]:
-    state, found = online.start(3), []
+def passed(running: OnlineFilter, cuts: list[int]) -> list[np.ndarray]:
+    state, found = running.start(3), []
     for part in zip(*(np.split(each, cuts, axis=1) for each in stream()), strict=True):
-        state, *more = online.step(state, *part)
+        state, *more = running.step(state, *part)
         found.append(more)
     return [np.concatenate(each, axis=1) for each in zip(*found, strict=True)] + [state.states]
 
@@ -96,3 +97,19 @@ def test_it_is_the_same_without_a_compiler(
     monkeypatch.setattr(steps, "compiled", lambda source: None)
     for one, other in zip(compiled, passed(OnlineFilter(twin), cuts), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-11)
+
+
+def test_the_main_directions_have_most_of_the_effect_on_outputs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    twin = fitted("linear")
+    assert online.with_main_directions(twin, COMMANDS) is twin
+    count = len(twin.filter.directions(known_start=False))
+    weak = np.zeros((len(twin.values), 1))
+    weak[0] = 1e-4 * np.abs(twin.factor[0]).max()
+    more = replace(twin, factor=np.concatenate([weak, twin.factor], axis=1))
+    monkeypatch.setattr(online, "MAX_DIRECTIONS", count)
+    main = online.with_main_directions(more, COMMANDS).filter.directions(known_start=False)
+    own = twin.filter.directions(known_start=False)
+    assert len(main) == count < len(more.filter.directions(known_start=False))
+    np.testing.assert_allclose(main.T @ main, own.T @ own, rtol=1e-3, atol=1e-9)

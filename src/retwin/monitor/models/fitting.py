@@ -34,6 +34,7 @@ from retwin.monitor.models.monitor import Monitor
 from retwin.twins.twin import check_channels
 from retwin.update.blackbox import fit_black_box
 from retwin.update.blackbox.levels import fit_levels
+from retwin.update.dynamics.filter.online import with_main_directions
 from retwin.update.dynamics.filter.prediction import log_density
 from retwin.update.dynamics.twin import DynamicsTwin
 
@@ -95,6 +96,7 @@ def fit_monitor(
     finite("alpha", alpha, at_least=1e-12, at_most=0.5)
     for note in summarise(check_records(healthy).findings):
         warnings.warn(f"healthy: {note}", stacklevel=2)
+    twin = with_main_directions(twin, healthy.commands.astype(float))
     measured = np.where(healthy.mask, healthy.observed, np.nan).astype(float)
     steps = resolution(np.moveaxis(measured, 2, 0).reshape(measured.shape[2], -1))
     expected = "records with which the filter of the twin stays finite"

@@ -20,11 +20,15 @@ from retwin.update.dynamics.filter.filtering import STEP
 from retwin.update.dynamics.filter.prediction import Narrowing
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["FilterState", "OnlineFilter", "moved"]
+__all__ = ["FilterState", "OnlineFilter", "moved", "with_main_directions"]
 
 GATE = 100.0
 """Number of standard deviations from which on an error is no news of the states: a sample of 1e300
 would stay in them. Where such samples persist, the uncertainty grows until they are used."""
+
+MAX_DIRECTIONS = 16
+"""Directions in which the parameters of a system may differ from those of its twin, at most: the
+filter has a copy for each. A library of terms has hundreds, most of which hardly change outputs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +75,32 @@ def moved(twin: DynamicsTwin, centre: Sequence[float]) -> DynamicsTwin:
         return twin
     directions = twin.filter.directions(known_start=False)
     return replace(twin, values=twin.values + np.asarray(centre) @ directions)
+
+
+def with_main_directions(twin: DynamicsTwin, commands: NDArray) -> DynamicsTwin:
+    """The twin whose parameters are uncertain along their `MAX_DIRECTIONS` main directions alone.
+
+    They are the principal ones of the effect of posterior deviations on simulated outputs, in
+    deviations of their noise. A twin with no more directions stays as it is.
+
+    Parameters
+    ----------
+    twin : DynamicsTwin
+        The twin.
+    commands : ndarray, shape (n, T, d_u)
+        Those that are simulated.
+
+    """
+    if len(twin.filter.directions(known_start=False)) <= MAX_DIRECTIONS:
+        return twin
+    running = twin.factor.copy()
+    running[-len(twin.process) :] = 0.0  # of a running system the start does not matter
+    theta = np.tile(twin.values, (len(commands), 1))
+    slopes = twin.equations.steps().sensitivities(commands, theta)[1] @ running
+    effects = (slopes / np.sqrt(twin.noise)[:, None]).reshape(-1, running.shape[1])
+    effects = effects[np.isfinite(effects).all(axis=1)]
+    main = np.linalg.eigh(effects.T @ effects)[1][:, -MAX_DIRECTIONS:]
+    return replace(twin, factor=twin.factor @ main)
 
 
 @dataclass(frozen=True, eq=False)
