@@ -194,11 +194,16 @@ def ends_in(argument: str, path: object, suffixes: Sequence[str], *, remedy: str
 
 
 def existing(
-    argument: str, path: object, there: bool, what: str = "an existing file or folder"
+    argument: str,
+    path: object,
+    there: bool,
+    what: str = "an existing file or folder",
+    *,
+    remedy: str = "check the name",
 ) -> None:
     """Require what is at a path to be there, which `what` names."""
     got = f"{path}, where there is none"
-    require(there, argument, expected=what, got=got, remedy="check the name")
+    require(there, argument, expected=what, got=got, remedy=remedy)
 
 
 def given(argument: str, value: T | None, expected: str, *, got: object = "none", remedy: str) -> T:

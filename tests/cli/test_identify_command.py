@@ -18,6 +18,7 @@ from fmus import c_fmu
 import retwin as rt
 from retwin.cases.updated_case import updated_case
 from retwin.cli.reading import read
+from retwin.deploy.identified import identified_by
 from retwin.update import identification
 
 RATE = 50.0
@@ -387,6 +388,10 @@ def test_columns_that_are_named_once_are_known_to_later_commands(place: Path, ca
     assert code == 0, err
     case = rt.cases.get("out/updated.toml")
     assert case.logs.names == {"valve": "FIC 1", "level": "TT 2"}
+    used = rt.load("out/logs.npz")
+    assert identified_by("out/updated.toml", used.between(2.0, used.steps / used.rate))
+    assert not identified_by("out/updated.toml", used.replace(observed=used.observed + 1.0))
+    assert not identified_by("tank.toml", used)
     code, _, err = call("fit", "out/updated.toml", "--real", "plant0.csv", "--seed", "0",
                         "--correction", "additive", "--no-compare", "--out", "model")  # fmt: skip
     assert code == 0, err

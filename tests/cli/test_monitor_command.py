@@ -76,7 +76,7 @@ def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:
     second = replace(within, name="weak pump", size=(-0.5, -0.6, -0.4), unit="", same=False)
     (row,) = _event_rows(watched, [found, second], 1.0)  # type: ignore[arg-type]
     assert row[-1].endswith(
-        "; then weak pump from 3.1 s; size -0.5 (-0.6 to -0.4), probability 0.80"
+        "; with more samples: weak pump from 3.1 s; size -0.5 (-0.6 to -0.4), probability 0.80"
     )
 
 
@@ -97,6 +97,7 @@ def test_a_leak_is_reported_with_its_time_and_cause(watched: Path, call) -> None
     words = " ".join(printed.split())
     assert "This replay of 13.3 minutes shows 1 event; if the machine was healthy all" in words
     assert "(exact 95 %). The promise of at most one false event in" in words
+    assert "More events were seen than it allows: these are faults, or" in words
     assert "probability 1.00" in words
     assert first["cause"]["unit"] == "1/s"
 
@@ -182,6 +183,24 @@ def test_what_cannot_calibrate_leaves_nothing(watched: Path, call, tmp_path) -> 
 def test_what_is_no_monitor_is_refused(watched: Path, call) -> None:
     code, _, err = call("monitor", "replay", watched / "model", watched / "leak.npz")
     assert (code, "monitor" in err) == (2, True), err
+
+
+def test_a_model_without_state_equations_calibrates_no_monitor(
+    watched: Path, call, tmp_path: Path
+) -> None:
+    corrected = tmp_path / "corrected"
+    corrected.mkdir()
+    (corrected / "model.json").write_text('{"kind": "corrected", "schema": 1}')
+    code, _, err = call(
+        "monitor", "fit", corrected, watched / "healthy.npz", "--out", tmp_path / "no"
+    )
+    assert (code, "StateTwin" in err, "leave the model out" in err) == (2, True, True), err
+
+
+def test_a_folder_that_is_no_store_is_not_made_one(call, tmp_path: Path) -> None:
+    code, _, err = call("monitor", "recalibrate", tmp_path, "--asset", "tank")
+    assert (code, "monitor.sqlite" in err) == (2, True), err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

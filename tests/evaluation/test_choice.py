@@ -495,7 +495,8 @@ def test_a_sample_that_predicts_better_is_named_as_what_it_is(
     [
         (0.9, None, ""),
         (0.84, None, "fewer than five records cannot tell"),
-        (0.84, (0.7, 0.86), "these records cannot tell"),
+        (0.84, (0.7, 0.92), "these records cannot tell"),
+        (0.84, (0.7, 0.88), "do not rely on it here"),
         (0.7, (0.6, 0.84), "do not rely on it here"),
     ],
 )
@@ -515,3 +516,25 @@ def test_the_coverage_of_five_records_has_an_interval_that_contains_it() -> None
         assert (row.interval is None) == (len(runs) < 5)
     assert row.interval is not None
     assert 0 <= row.interval[0] <= row.coverage <= row.interval[1] <= 1
+
+
+def test_a_twin_that_was_identified_by_the_records_is_judged_without_each_part() -> None:
+    data = records(0, slope=right, steps=300)
+    names = ("parameters", "output")
+    found = rt.fit(twin_of(), data, rt.Choice(identified=True, method="output"))
+    assert tuple(each.name for each in found.scores)[:1] == names[:1]
+    assert any("identified by these records" in each for each in found.remarks)
+    named = rt.fit(twin_of(), data, rt.Choice(candidates=FAST[:2], identified=True))
+    assert [each.name for each in named.scores] == list(FAST[:2])
+    assert not any("identified by these records" in each for each in named.remarks)
+
+
+def test_a_parameter_at_an_end_of_its_range_is_named() -> None:
+    narrow = [replace(each, high=0.25, start=0.2) for each in twin_of().parameters[:1]]
+    twin = replace(twin_of(), parameters=(*narrow, *twin_of().parameters[1:]))
+    settings = rt.Choice(candidates=FAST[:2], method=FAST[1])
+    with pytest.warns(UserWarning, match="at a bound: gain"):
+        found = rt.fit(twin, records(0, slope=right, steps=300), settings)
+    assert any(
+        each.startswith("gain is at an end of its range, 0.25 K/J") for each in found.remarks
+    )

@@ -86,6 +86,7 @@ def fit(
     best; or that of --dynamics, of --correction, or of a case with classes.
     """
     import retwin as rt
+    from retwin.deploy.identified import identified_by
     from retwin.evaluation.choice.fitted import HOLDS
     from retwin.evaluation.choice.surrogates import SurrogateSettings
     from retwin.update.residual.fitting import calibrating
@@ -134,6 +135,7 @@ def fit(
         horizon=seconds,
         method=method,
         compare=compare,
+        identified=identified_by(case, measured),
         calibrate_on=faults,
         prior=prior,
     )

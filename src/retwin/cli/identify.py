@@ -118,7 +118,8 @@ def identify(
     columns = replace(_columns(column, time, transient), mapping=mapping)
     names = [channel_names(each) for each in (inputs, outputs)]
     for log in logs:
-        existing("LOG", log, log.exists())
+        joined = "check the name; several names after an option are joined by commas: a,b"
+        existing("LOG", log, log.exists(), remedy=joined)
     reader = LogReader(columns, max_bytes)
     opened, left_out = _opened(twin, logs, reader, free or (), names, rate)
     if columns == Columns() and opened.case is not None:

@@ -189,6 +189,7 @@ CLEAR = 0.01
 def _verdict(scores: list[ModelScore]) -> list[str]:
     """What is better than the model, and whether its bands hold, in sentences."""
     from retwin.scores.uses import COVERAGE
+    from retwin.update.forecast_errors import LEVEL
 
     made = []
     words = {"twin": "the twin before its update", "mean": "the mean of the record itself"}
@@ -200,7 +201,7 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
                 made.append(f"{each.output}: {words[each.who]} is a better prediction.")
         elif each.coverage < COVERAGE[0]:
             text = f"{each.output}: the 90 % band holds {each.coverage:.0%} of these samples"
-            if each.interval is None or each.interval[1] >= COVERAGE[0]:
+            if each.interval is None or each.interval[1] >= LEVEL:
                 known = "fewer than five" if each.interval is None else "these"
                 made.append(
                     f"{text}; {known} records cannot tell whether that is by "

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from retwin import catalog
-from retwin.checks import at_least, finite, positive, require
+from retwin.checks import at_least, existing, finite, positive, require
 from retwin.cli.commands import Commands
 from retwin.cli.options import (
     Json,
@@ -99,6 +99,14 @@ def fit(
         leave_out({"--lasting": lasting}, "for a diagnoser, which watches whole trajectories")
         _fit_trajectories(model, healthy, out, false_alarms, case, reading, as_json)
         return
+    require(
+        model is None or kind_of(saved(model)) != "corrected",
+        str(model),
+        expected="a model with state equations, of retwin fit --dynamics",
+        got="one whose outputs are corrected, which cannot be filtered sample by sample",
+        remedy="write the twin as a StateTwin (docs/twins.md#states) and fit it with --dynamics, "
+        "or leave the model out: healthy logs alone calibrate a monitor too",
+    )
     known = DynamicsTwin.load(model) if model else None
     system = case_named(case or (known.case if known else None) or None)
     tables = all(each.suffix.lower() == ".csv" for each in healthy)
@@ -371,7 +379,10 @@ def recalibrate(
     """Propose a monitor of the last quiet hours, in the shadow of the active one."""
     from retwin.monitor import Store
     from retwin.monitor import recalibrate as propose
+    from retwin.monitor.store.store import FILE
 
+    kept = bool(url) or (saved(store) / FILE).is_file()
+    existing("STORE", store, kept, f"the folder of a store, with {FILE}, or its --url")
     with Store(saved(store), url) as opened, bar("calibrate") as show:
         show("monitor", 0.0)
         version = propose(opened, asset, hours=hours, new_normal=new_normal)
@@ -437,7 +448,7 @@ def _event_rows(
         end = ends.get((first.trajectory, first.event))
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
-        begin, texts = f"{first.time:.6g}", "; then ".join(map(text, named))
+        begin, texts = f"{first.time:.6g}", "; with more samples: ".join(map(text, named))
         if named:  # a fault that lasts may not show for a while
             texts = "again, or still: " * (named[0].name == before.get(first.trajectory)) + texts
             before[first.trajectory] = named[-1].name
@@ -479,6 +490,8 @@ def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
 
 def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> str:
     """What a replay shows of the rate of false events, with its exact bound, and the promise."""
+    from scipy.stats import poisson
+
     from retwin.monitor.detect.promise import duration, shortest
     from retwin.report.labels import counted
 
@@ -487,10 +500,16 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     events = sum(each.promised for _, watched in found for each in watched.events)
     bound = duration(shortest(events, samples) / rate)
     shown = f"{duration(samples / rate)} shows {counted(events, 'event')}"
-    return (
+    text = (
         f"This replay of {shown}; if the machine was healthy all the time, that alone bounds their "
         f"rate at one in {bound} (exact 95 %). {_describe_promise(monitor)}"
     )
+    if events and poisson.sf(events - 1, samples / monitor.run_length) < monitor.alpha:
+        text += (
+            " More events were seen than it allows: these are faults, or, if the machine was "
+            "healthy, the promise does not hold for it; then calibrate with these records too."
+        )
+    return text
 
 
 def _describe_promise(monitor: Monitor) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic_core import to_jsonable_python
 
 from retwin._version import __version__
@@ -17,8 +18,9 @@ from retwin.cases.file import read_case
 from retwin.cases.logs import Logs
 from retwin.cases.opened_twin import OpenedTwin
 from retwin.cases.updated_case import updated_case
-from retwin.data.io import save
+from retwin.data.io import load, save
 from retwin.data.quality.check import Checked
+from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.evaluation.identification.parameters import spread_of
 from retwin.evaluation.identification.validation import Identification
@@ -34,6 +36,28 @@ SCHEMA = 1
 """The version of identification.json."""
 HOLDS = ("identification.json", "logs.npz", "report.html", "start_values.json", "updated.toml")
 """The files in the folder."""
+
+
+def identified_by(case: str | os.PathLike[str], records: Trajectories) -> bool:
+    """Whether the parameters of a case were identified by one of these records, or more.
+
+    Such a case is the updated.toml of `save_identification`, beside its measurements.
+    """
+    folder = Path(case).parent
+    if Path(case).name not in HOLDS or not all((folder / each).is_file() for each in HOLDS[:2]):
+        return False
+    known, given = (
+        [own.observed[i][own.mask[i]] for i in range(len(own)) if own.mask[i].any()]
+        for own in (load(folder / "logs.npz"), records)
+    )
+    # The begin of a record may have been left out of the identification.
+    return any(_same_ends(one, other) for one in known for other in given)
+
+
+def _same_ends(one: NDArray, other: NDArray) -> bool:
+    """Whether the shorter of two arrays is the end of the longer one."""
+    size = min(len(one), len(other))
+    return np.array_equal(one[-size:], other[-size:])
 
 
 def save_identification(

@@ -165,3 +165,10 @@ def test_outputs_that_never_change_have_no_share() -> None:
     assert found.values["explained"] == {"healthy": {}}
     assert found.sentences == []
     assert [each.channel for each in found.findings if each.kind == "never changes"] == ["y1"]
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_outputs_whose_variance_overflows_are_read() -> None:
+    x = np.random.default_rng(0).normal(size=(3, 50, 1))
+    records = rt.Trajectories(commands=x, nominal=x, observed=1e200 * x, rate=10.0)
+    assert check_records(records).findings == ()

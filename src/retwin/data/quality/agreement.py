@@ -137,7 +137,7 @@ def _units(names: list[str], y: NDArray, ideal: NDArray) -> Iterator[Finding]:
     seen = np.isfinite(y)
     for k, name in enumerate(names):
         a, b = y[..., k][seen[..., k]], ideal[..., k][seen[..., k]]
-        if len(a) < 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
+        if len(a) < 2 or np.ptp(a) == 0 or np.ptp(b) == 0 or not np.isfinite(a.std() / b.std()):
             continue
         correlation = float(np.corrcoef(a, b)[0, 1])
         decades = float(np.log10(a.std() / b.std()))

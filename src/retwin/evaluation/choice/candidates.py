@@ -57,7 +57,10 @@ class Candidates:
     @property
     def fits(self) -> dict[str, Callable[[], Model]]:
         """The candidates that the twin and the records allow, the simplest first."""
-        made: dict[str, Callable[[], Model]] = {"none": self.none}
+        wanted, made = self.settings.candidates, dict[str, Callable[[], Model]]()
+        named = "none" in (*wanted, self.settings.method)
+        if named or not (self.settings.identified and self.free is not None):
+            made["none"] = self.none
         if self.free is not None:
             made["parameters"] = self.parameters
         if self._has_segments("delay_offset"):
@@ -71,7 +74,6 @@ class Candidates:
         made["output"] = lambda: self.per_sample(self.identified)
         if state_names(self.twin):
             made["dynamics_output"] = lambda: self.per_sample(self.dynamics)
-        wanted = self.settings.candidates
         return {name: fit for name, fit in made.items() if not wanted or name in wanted}
 
     @property

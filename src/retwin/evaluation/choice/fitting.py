@@ -55,6 +55,12 @@ UNSTABLE = (
 )
 """What is said where candidates were judged over a shorter time than was asked for."""
 
+IDENTIFIED = (
+    "The parameters of the twin were identified by these records, so that the twin as it is has "
+    "seen all of them: it is judged with parameters that are identified without each part."
+)
+"""What is said in place of the errors of a twin that has seen the parts that are left out."""
+
 
 @one_thread()  # fits are small, and threads that wait for each other take longer
 def fit(
@@ -141,16 +147,19 @@ def fit(
         for name in trials.names
     )
     remarks = remarks_of(records, comparison, scores, chosen, preferred, horizon)
+    if settings.identified and "none" not in names and "parameters" in names:
+        remarks = (*remarks, IDENTIFIED)
     if horizon != settings.horizon:
         remarks = (UNSTABLE.format(horizon), *remarks)
     predicted, deviation = _predictions_of(comparison, chosen)
+    parameters = _parameters(whole, model)
     found = Fitted(
         twin=model,
         chosen=chosen,
         preferred=preferred,
         scores=scores,
-        remarks=(*remarks, *_of_prior(model, others)),
-        parameters=_parameters(whole, model),
+        remarks=(*remarks, *_at_bounds(whole, parameters), *_of_prior(model, others)),
+        parameters=parameters,
         horizon=horizon,
         parts=tuple(each.name for each in folds),
         records=records,
@@ -411,3 +420,18 @@ def _parameters(whole: Candidates, model: Model) -> dict[str, tuple[float, float
     elif isinstance(inside, ParametricTwin):
         now = dict(zip(inside.names, inside.values, strict=True))
     return {name: (before[name], alone[name], now.get(name, alone[name])) for name in before}
+
+
+def _at_bounds(
+    whole: Candidates, parameters: dict[str, tuple[float, float, float]], *, near: float = 1e-3
+) -> list[str]:
+    """Which parameters of the model are at an end of their range, up to a share `near` of it."""
+    made = []
+    for each in whole.free.parameters if whole.free else ():
+        value, margin = parameters[each.name][2], near * (each.high - each.low)
+        if not each.low + margin < value < each.high - margin:
+            made.append(
+                f"{each.name} is at an end of its range, {value:.4g} {each.unit}: its value may "
+                "lie beyond, or stand for something else that the twin lacks."
+            )
+    return made

@@ -79,7 +79,8 @@ def _describe_uncorrected(
     if not (free and reasons):
         return [made]
     text = f"The errors there {' and '.join(reasons)}: the twin lacks something that these "
-    return [made, f"{text}corrections cannot express, if it is no disturbance from outside."]
+    text += "corrections cannot express, unless it is a disturbance from outside or sensor noise."
+    return [made, text]
 
 
 def _worse_than_mean(records: Trajectories, score: CandidateScore) -> list[str]:

@@ -61,6 +61,9 @@ class Choice:
     compare : bool
         Whether candidates are compared; else `method` is fitted to all records, and its bands are
         those of its own fit.
+    identified : bool
+        Whether the parameters of the twin were identified by these records, so that the twin as it
+        is has seen each part that is left out: it is no candidate unless it is named.
     calibrate_on : str or mapping
         The records that are used, see `fit_residual`; only healthy ones are compared.
     prior : Residual, CorrectedTwin, folder, or several of them, optional
@@ -83,6 +86,7 @@ class Choice:
     sequence: SequenceMixture = SequenceMixture()  # noqa: RUF009 - frozen
     yardstick: bool = False
     compare: bool = True
+    identified: bool = False
     calibrate_on: str | Mapping[str, Fault | None] = "healthy"
     prior: Priors | None = None
 

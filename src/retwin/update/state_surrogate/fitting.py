@@ -306,8 +306,9 @@ def _test(
         f"tenth of the samples, {last[worst]:.3g} in the last)",
         remedy="give more simulations, a wider network (hidden), a smaller spread of the "
         "parameters, all under [state_surrogate] of a case, or shorter trajectories; chaos, "
-        "impacts, switches and dead time can hardly be learned: use the twin itself with a "
-        "correction of its outputs",
+        "impacts, switches and dead time can hardly be learned: write the equations as a "
+        "StateTwin (docs/twins.md#states), or correct the outputs of the twin as it is, without "
+        "dynamics; a monitor needs state equations",
     )
     columns = {
         "rmse": whole * deviation,
