@@ -185,16 +185,23 @@ def test_what_is_no_monitor_is_refused(watched: Path, call) -> None:
     assert (code, "monitor" in err) == (2, True), err
 
 
-def test_a_model_without_state_equations_calibrates_no_monitor(
+@pytest.mark.slow
+def test_a_model_without_state_equations_is_watched_by_a_black_box(
     watched: Path, call, tmp_path: Path
 ) -> None:
-    corrected = tmp_path / "corrected"
-    corrected.mkdir()
-    (corrected / "model.json").write_text('{"kind": "corrected", "schema": 1}')
-    code, _, err = call(
-        "monitor", "fit", corrected, watched / "healthy.npz", "--out", tmp_path / "no"
-    )
-    assert (code, "StateTwin" in err, "leave the model out" in err) == (2, True, True), err
+    case, healthy = watched / "case.toml", watched / "healthy.npz"
+    given = (case, "--real", healthy, "--correction", "additive", "--no-compare")
+    code, _, err = call("fit", *given, "--out", tmp_path / "model")
+    assert code == 0, err
+    out = tmp_path / "watch"
+    code, printed, err = call("monitor", "fit", tmp_path / "model", healthy, "--out", out)
+    assert code == 0, err
+    words = " ".join(printed.split())
+    assert "model has no state equations" in words
+    assert "causes are channels" in words
+    code, printed, err = call("monitor", "replay", out, watched / "leak.npz")
+    assert code == 0, err
+    assert "1 event" in printed
 
 
 def test_a_folder_that_is_no_store_is_not_made_one(call, tmp_path: Path) -> None:

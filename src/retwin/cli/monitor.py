@@ -49,8 +49,13 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
     from retwin.cases.twin_data import TwinData
     from retwin.monitor import Alarm, Cause, Monitor, Watched
-    from retwin.update import DynamicsTwin
+    from retwin.update import CorrectedTwin, DynamicsTwin
 
+EQUATIONS = (
+    "Written as a StateTwin (docs/twins.md#states) and fitted with --dynamics, the twin itself is "
+    "watched, and causes are its parameters too."
+)
+"""What is said of a model whose outputs are corrected."""
 EVENT = ("file", "record", "from s", "to s", "what", "cause")
 """What is shown of an event."""
 CONFIG = Path("monitor.toml")
@@ -83,10 +88,11 @@ def fit(
 ) -> None:
     """Calibrate a monitor on healthy records, best not those that MODEL was fitted to.
 
-    Without MODEL a black box of the records takes the place of a twin.
+    Without MODEL, or with one whose outputs are corrected, a black box of the
+    records takes the place of a twin.
     """
     from retwin.monitor import fit_monitor, possible_causes, visible_sizes
-    from retwin.update import DynamicsTwin
+    from retwin.update import DynamicsTwin, load_twin
 
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     model = files[0] if files[0].is_dir() and (files[0] / "model.json").is_file() else None
@@ -99,22 +105,15 @@ def fit(
         leave_out({"--lasting": lasting}, "for a diagnoser, which watches whole trajectories")
         _fit_trajectories(model, healthy, out, false_alarms, case, reading, as_json)
         return
-    require(
-        model is None or kind_of(saved(model)) != "corrected",
-        str(model),
-        expected="a model with state equations, of retwin fit --dynamics",
-        got="one whose outputs are corrected, which cannot be filtered sample by sample",
-        remedy="write the twin as a StateTwin (docs/twins.md#states) and fit it with --dynamics, "
-        "or leave the model out: healthy logs alone calibrate a monitor too",
-    )
-    known = DynamicsTwin.load(model) if model else None
-    system = case_named(case or (known.case if known else None) or None)
+    updated = load_twin(model) if model else None
+    known = updated if isinstance(updated, DynamicsTwin) else None
+    system = case_named(case or (updated.case if updated else None) or None)
     tables = all(each.suffix.lower() == ".csv" for each in healthy)
-    if known is None and system is None and mapping is None and tables:
+    if updated is None and system is None and mapping is None and tables:
         records = [read_signals(healthy, max_bytes)]
     else:
         records = [
-            _healthy(reading(file, system or _named(known), part="calibration"), file)
+            _healthy(reading(file, system or _named(updated), part="calibration"), file)
             for file in healthy
         ]
     with bar("calibrate") as show:
@@ -129,12 +128,14 @@ def fit(
         seen = partial(show, "faults that are seen")
         found = visible_sizes(made, given, causes, progress=lambda share: seen((1 + share) / 2))
         made = replace(made, visible=tuple(found))
-    if case:  # by which records are read later too
-        made = replace(made, twin=replace(made.twin, case=stored_name(case)))
+    name = stored_name(case) if case else (updated.case if updated else "")
+    made = replace(made, twin=replace(made.twin, case=name))  # by which records are read later too
     made.save(out)
     twin = made.twin
     hours = given.mask.any(axis=2).sum() / twin.rate / 3600
     box = f"No twin: a black box, calibrated on {hours:.3g} h of your data; causes are channels."
+    if updated:
+        box = f"{model} has no state equations to be followed sample by sample. {box} {EQUATIONS}"
     promises = {name: str(each) for name, each in made.promises.items()}
     tried = made.tried.text(twin.rate)
     about = {"arl": made.arl, "run_length": made.run_length, "warm_up": made.warm_up}
@@ -390,7 +391,7 @@ def recalibrate(
     answer(vars(version), text, as_json=as_json)
 
 
-def _named(twin: DynamicsTwin | None) -> TwinData | None:
+def _named(twin: CorrectedTwin | DynamicsTwin | None) -> TwinData | None:
     """What `read` takes for a case: the twin by whose channels the columns of a table are named."""
     from retwin.cases.twin_data import TwinData
 

@@ -308,7 +308,7 @@ def _test(
         "parameters, all under [state_surrogate] of a case, or shorter trajectories; chaos, "
         "impacts, switches and dead time can hardly be learned: write the equations as a "
         "StateTwin (docs/twins.md#states), or correct the outputs of the twin as it is, without "
-        "dynamics; a monitor needs state equations",
+        "dynamics",
     )
     columns = {
         "rmse": whole * deviation,
