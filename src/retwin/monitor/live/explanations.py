@@ -21,6 +21,7 @@ from retwin.monitor.models.cause import (
     EVENT,
     Cause,
     cause_data,
+    explains,
     find_cause,
     is_due,
     possible_causes,
@@ -102,8 +103,8 @@ class Explanations:
         self._queue = _Turns()
         self._alarms: dict[str, tuple[list[Entry], Entry | None]] = {}
         """Of each machine the alarms that its event is explained by, and the newest one."""
-        self._current: dict[tuple[str, int], str] = {}
-        """The cause of each event, by its machine and time."""
+        self._current: dict[tuple[str, int], tuple[str, bool]] = {}
+        """The cause of each event, by its machine and time, and whether it explains that."""
         self._closed = threading.Event()
         self._taking = threading.Lock()
         self._last = -1
@@ -167,7 +168,8 @@ class Explanations:
     def _keep(self, alarm: Entry, cause: dict[str, Any]) -> None:
         """Keep what the event of an alarm is explained by."""
         if not cause.get("same"):
-            self._current[alarm.data["asset"], _event(alarm.data)] = cause["name"]
+            explained = explains(cause["probability"], cause["unknown"])
+            self._current[alarm.data["asset"], _event(alarm.data)] = cause["name"], explained
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -217,9 +219,16 @@ class Explanations:
         record = record_of(monitor.twin, values)
         *earlier, newest = [_alarm(each.data, int(times[0]), period) for each in entries]
         alarms = [*earlier, replace(newest, sample=record.steps - 1)]
-        current = self._current.get((name, _event(last)), "")
-        known = self.causes(twin, monitor)
-        found = find_cause(monitor.twin, record, alarms, known, current=current, known_start=False)
+        current, explained = self._current.get((name, _event(last)), ("", True))
+        found = find_cause(
+            monitor.twin,
+            record,
+            alarms,
+            self.causes(twin, monitor),
+            current=current,
+            explained=explained,
+            known_start=False,
+        )
         return found, int(times[0])
 
 

@@ -93,6 +93,11 @@ class Cause:
     unit: str = ""
     limit: bool = False
 
+    @property
+    def explains(self) -> bool:
+        """Whether it is probable also among causes that are not known."""
+        return explains(self.probability, self.unknown)
+
 
 def cause_title(name: str) -> str:
     """A cause as it is shown: an alarm that the healthy class explains best has no known cause."""
@@ -257,7 +262,7 @@ def find_causes(
     whole("before", before, at_least=MIN_WINDOW)
     ids, found = record.ids.tolist(), list[Cause]()
     newest, inferred = dict[str, Alarm](), dict[tuple[str, int], list[Alarm]]()
-    current, latest = dict[tuple[str, int], str](), dict[tuple[str, int], Cause]()
+    current, latest = dict[tuple[str, int], Cause](), dict[tuple[str, int], Cause]()
     for alarm in alarms:
         require(
             alarm.trajectory in ids and alarm.sample < record.steps,
@@ -278,11 +283,12 @@ def find_causes(
                 known,
                 faults,
                 before,
-                current=current.get(event, ""),
+                current=current[event].name if event in current else "",
+                explained=event not in current or current[event].explains,
                 known_start=known_start,
             )
             if not latest[event].same:
-                current[event] = latest[event].name
+                current[event] = latest[event]
             found.append(latest[event])
         else:
             found.append(replace(latest[event], alarm=alarm, same=True))
@@ -308,6 +314,11 @@ def is_due(inferred: Sequence[int], sample: int) -> bool:
     return sample - inferred[-1] > max(MIN_WINDOW, GROWTH * (inferred[-1] - inferred[0]))
 
 
+def explains(probability: float, unknown: float) -> bool:
+    """Whether a cause is probable also among those that are not known; see `Cause`."""
+    return probability * (1 - unknown) > PROBABLE
+
+
 def find_cause(
     twin: DynamicsTwin,
     record: Trajectories,
@@ -316,6 +327,7 @@ def find_cause(
     before: int = BEFORE,
     *,
     current: str = "",
+    explained: bool = True,
     known_start: bool = True,
 ) -> Cause:
     """The cause of the last of a trajectory's alarms, see `find_causes`.
@@ -331,6 +343,9 @@ def find_cause(
         inferred.
     current : str
         The cause that the event has; "" for none.
+    explained : bool
+        Whether that explained what it was inferred from. If not, another one takes its place only
+        where it explains all of the event: in few samples each cause seems to.
 
     """
     alarm, own = alarms[-1], [each for each in alarms if each.event == alarms[-1].event]
@@ -342,16 +357,14 @@ def find_cause(
     def infer(begin: int) -> Cause:
         return _infer(twin, record, begin, alarm, faults, known_start and begin == 0)
 
-    def likely(cause: Cause) -> bool:
-        return cause.probability * (1 - cause.unknown) > PROBABLE
-
     start = max(0, first)
     if len(own) == 1:
         return infer(start)
     whole = infer(start) if alarm.sample - opening <= before else None
     begin = max(0, own[-2].sample + 1, alarm.sample - before)
-    cause = whole if whole is not None and likely(whole) else infer(begin)
-    same = cause.name in (current, HEALTHY) or not likely(cause)
+    cause = whole if whole is not None and whole.explains else infer(begin)
+    same = cause.name in (current, HEALTHY) or not cause.explains
+    same |= not (explained or cause is whole)
     known = faults.get(current)
     if not same and isinstance(known, TimedFault):
         both = known, faults[cause.name]

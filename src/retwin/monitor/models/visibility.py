@@ -77,14 +77,16 @@ def visible_sizes(
             continue
         largest = _largest(fault)
         sizes = [None] if largest is None else [largest / 2**i for i in range(HALVINGS + 1)]
-        best, share = None, np.nan
-        for size in sizes:
-            now = _share(monitor, windows, fault, size)
-            if now < SHARE:
-                share = share if best is not None else now
-                break
-            if now >= SHARE:
-                best, share = size, now
+        best, share = None, _share(monitor, windows, fault, sizes[0])
+        if share >= SHARE:
+            best, unseen = sizes[0], sizes[1:]  # larger sizes are seen, smaller ones are not
+            while unseen:
+                middle = len(unseen) // 2
+                now = _share(monitor, windows, fault, unseen[middle])
+                if now >= SHARE:
+                    best, share, unseen = unseen[middle], now, unseen[middle + 1 :]
+                else:
+                    unseen = unseen[:middle]
         if np.isfinite(share):  # of a fault that the twin can simulate
             unit = size_unit(fault, monitor.twin)
             made.append(Visible(name, best, largest, share, within, unit))

@@ -26,7 +26,7 @@ GATE = 100.0
 """Number of standard deviations from which on an error is no news of the states: a sample of 1e300
 would stay in them. Where such samples persist, the uncertainty grows until they are used."""
 
-MAX_DIRECTIONS = 16
+MAX_DIRECTIONS = 32
 """Directions in which the parameters of a system may differ from those of its twin, at most: the
 filter has a copy for each. A library of terms has hundreds, most of which hardly change outputs."""
 
