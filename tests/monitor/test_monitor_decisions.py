@@ -501,6 +501,7 @@ def found_cause(
     earlier: int | None = None,
     better: bool = False,
     current: str = "leak",
+    explained: bool = True,
 ) -> tuple[bool, list[int]]:
     """Whether a further alarm is of the same cause, and the windows that it was found from."""
     classes = ["Healthy", "leak", "pump"]
@@ -527,7 +528,14 @@ def found_cause(
         alarms.insert(0, Alarm("0", earlier, float(earlier), "level", "", 1e6, earlier))
     faults = {"Healthy": None, "leak": LEAK, "pump": PUMP}
     record = recorded(0)
-    made = cause.find_cause(None, record, alarms, faults, current=current)  # type: ignore[arg-type]
+    made = cause.find_cause(
+        None,  # type: ignore[arg-type]
+        record,
+        alarms,
+        faults,
+        current=current,
+        explained=explained,
+    )
     return made.same, steps
 
 
@@ -556,6 +564,17 @@ def test_a_further_alarm_has_a_cause_of_its_own_where_that_is_probable_and_bette
     assert found == (same, windows)
     older = found_cause(monkeypatch, name, probability, unknown, samples=(200, 301), better=better)
     assert older == (same, [101])
+
+
+def test_a_cause_that_explains_little_is_replaced_by_one_of_the_whole_event(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for last, same in ((300, False), (301, True)):
+        given = ("pump", 0.9, 0.0)
+        found, _ = found_cause(
+            monkeypatch, *given, samples=(200, last), better=True, explained=False
+        )
+        assert found is same
 
 
 def test_the_first_alarm_of_an_event_has_its_own_cause(monkeypatch: pytest.MonkeyPatch) -> None:
