@@ -14,7 +14,7 @@ from retwin.data.trajectories import HEALTHY, Channels, Trajectories
 from retwin.errors import InputError
 from retwin.twins.twin import Twin
 
-CONSTANT = "constant in what was read, which so shows no dynamics of it."
+CONSTANT = "constant in what was read, which therefore shows no dynamics of it."
 """What is noted of channels that never change."""
 
 

@@ -44,7 +44,8 @@ def identified_by(case: str | os.PathLike[str], records: Trajectories) -> bool:
     Such a case is the updated.toml of `save_identification`, beside its measurements.
     """
     folder = Path(case).parent
-    if Path(case).name not in HOLDS or not all((folder / each).is_file() for each in HOLDS[:2]):
+    beside = [(folder / each).is_file() for each in ("identification.json", "logs.npz")]
+    if Path(case).name != "updated.toml" or not all(beside):
         return False
     known, given = (
         [own.observed[i][own.mask[i]] for i in range(len(own)) if own.mask[i].any()]

@@ -167,9 +167,10 @@ class Explanations:
 
     def _keep(self, alarm: Entry, cause: dict[str, Any]) -> None:
         """Keep what the event of an alarm is explained by."""
-        if not cause.get("same"):
+        event = alarm.data["asset"], _event(alarm.data)
+        if not cause.get("same") or cause["name"] == self._current.get(event, ("", True))[0]:
             explained = explains(cause["probability"], cause["unknown"])
-            self._current[alarm.data["asset"], _event(alarm.data)] = cause["name"], explained
+            self._current[event] = cause["name"], explained
 
     def _run(self) -> None:
         while not self._closed.is_set():

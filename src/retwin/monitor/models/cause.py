@@ -287,7 +287,7 @@ def find_causes(
                 explained=event not in current or current[event].explains,
                 known_start=known_start,
             )
-            if not latest[event].same:
+            if not latest[event].same or latest[event].name == current[event].name:
                 current[event] = latest[event]
             found.append(latest[event])
         else:
