@@ -21,7 +21,6 @@ from retwin.monitor.models.cause import (
     EVENT,
     Cause,
     cause_data,
-    explains,
     find_cause,
     is_due,
     possible_causes,
@@ -103,8 +102,8 @@ class Explanations:
         self._queue = _Turns()
         self._alarms: dict[str, tuple[list[Entry], Entry | None]] = {}
         """Of each machine the alarms that its event is explained by, and the newest one."""
-        self._current: dict[tuple[str, int], tuple[str, bool]] = {}
-        """The cause of each event, by its machine and time, and whether it explains that."""
+        self._current: dict[tuple[str, int], tuple[str, float]] = {}
+        """The cause of each event, by its machine and time, and whether there is more to it."""
         self._closed = threading.Event()
         self._taking = threading.Lock()
         self._last = -1
@@ -168,9 +167,8 @@ class Explanations:
     def _keep(self, alarm: Entry, cause: dict[str, Any]) -> None:
         """Keep what the event of an alarm is explained by."""
         event = alarm.data["asset"], _event(alarm.data)
-        if not cause.get("same") or cause["name"] == self._current.get(event, ("", True))[0]:
-            explained = explains(cause["probability"], cause["unknown"])
-            self._current[event] = cause["name"], explained
+        if not cause.get("same") or cause["name"] == self._current.get(event, ("", 0.0))[0]:
+            self._current[event] = cause["name"], cause["unknown"]
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -220,14 +218,14 @@ class Explanations:
         record = record_of(monitor.twin, values)
         *earlier, newest = [_alarm(each.data, int(times[0]), period) for each in entries]
         alarms = [*earlier, replace(newest, sample=record.steps - 1)]
-        current, explained = self._current.get((name, _event(last)), ("", True))
+        current, unexplained = self._current.get((name, _event(last)), ("", 0.0))
         found = find_cause(
             monitor.twin,
             record,
             alarms,
             self.causes(twin, monitor),
             current=current,
-            explained=explained,
+            unexplained=unexplained,
             known_start=False,
         )
         return found, int(times[0])

@@ -93,11 +93,6 @@ class Cause:
     unit: str = ""
     limit: bool = False
 
-    @property
-    def explains(self) -> bool:
-        """Whether it is probable also among causes that are not known."""
-        return explains(self.probability, self.unknown)
-
 
 def cause_title(name: str) -> str:
     """A cause as it is shown: an alarm that the healthy class explains best has no known cause."""
@@ -284,7 +279,7 @@ def find_causes(
                 faults,
                 before,
                 current=current[event].name if event in current else "",
-                explained=event not in current or current[event].explains,
+                unexplained=current[event].unknown if event in current else 0.0,
                 known_start=known_start,
             )
             if not latest[event].same or latest[event].name == current[event].name:
@@ -314,11 +309,6 @@ def is_due(inferred: Sequence[int], sample: int) -> bool:
     return sample - inferred[-1] > max(MIN_WINDOW, GROWTH * (inferred[-1] - inferred[0]))
 
 
-def explains(probability: float, unknown: float) -> bool:
-    """Whether a cause is probable also among those that are not known; see `Cause`."""
-    return probability * (1 - unknown) > PROBABLE
-
-
 def find_cause(
     twin: DynamicsTwin,
     record: Trajectories,
@@ -327,7 +317,7 @@ def find_cause(
     before: int = BEFORE,
     *,
     current: str = "",
-    explained: bool = True,
+    unexplained: float = 0.0,
     known_start: bool = True,
 ) -> Cause:
     """The cause of the last of a trajectory's alarms, see `find_causes`.
@@ -343,9 +333,9 @@ def find_cause(
         inferred.
     current : str
         The cause that the event has; "" for none.
-    explained : bool
-        Whether that explained what it was inferred from. If not, another one takes its place only
-        where it explains all of the event: in few samples each cause seems to.
+    unexplained : float
+        Probability that there was something besides. It is also that of a cause which explains
+        the newest samples alone: in few of them each cause seems to.
 
     """
     alarm, own = alarms[-1], [each for each in alarms if each.event == alarms[-1].event]
@@ -357,14 +347,16 @@ def find_cause(
     def infer(begin: int) -> Cause:
         return _infer(twin, record, begin, alarm, faults, known_start and begin == 0)
 
+    def likely(cause: Cause) -> bool:
+        return cause.probability * (1 - cause.unknown) > PROBABLE
+
     start = max(0, first)
     if len(own) == 1:
         return infer(start)
     whole = infer(start) if alarm.sample - opening <= before else None
     begin = max(0, own[-2].sample + 1, alarm.sample - before)
-    cause = whole if whole is not None and whole.explains else infer(begin)
-    same = cause.name in (current, HEALTHY) or not cause.explains
-    same |= not (explained or cause is whole)
+    cause = whole if whole is not None and likely(whole) else infer(begin)
+    same = cause.name in (current, HEALTHY) or not likely(cause)
     known = faults.get(current)
     if not same and isinstance(known, TimedFault):
         both = known, faults[cause.name]
@@ -372,6 +364,8 @@ def find_cause(
         same = not _better(twin, record, window, both, np.log(alarm.evidence), whole is not None)
     if whole is not None and same:
         cause = whole
+    elif cause is not whole:
+        cause = replace(cause, unknown=max(cause.unknown, unexplained))
     return replace(cause, same=same)
 
 
