@@ -47,5 +47,7 @@ class Visible:
                 else f"not seen up to {abs(self.largest):.3g}{of}"
             )
         else:
-            what = "seen" if self.size is None else f"seen from {abs(self.size):.3g}{of} on"
+            what = (
+                "seen" if self.size is None else f"seen from a size of {abs(self.size):.3g}{of} on"
+            )
         return f"{self.fault}: {what} ({self.share:.0%} within {self.within:.3g} s)"

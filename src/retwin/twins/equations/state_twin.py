@@ -361,7 +361,10 @@ class StateTwin(AdjustableTwin):
         finite = np.isfinite(states).all(axis=2) & np.isfinite(outputs).all(axis=2)
         for place in np.flatnonzero(~finite.all(axis=1)):
             finer = FINER * self.substeps
-            remedy = "check the parameters and the start, or the range of the equations"
+            remedy = (
+                "check the parameters and the start, or the range of the equations: low and high "
+            )
+            remedy += "of a State do not clamp it"
             again = simulated(index[place : place + 1], finer)
             if self.derivative is not None and all(np.isfinite(each).all() for each in again):
                 remedy = f"it is finite with {finer}: give more substeps"
