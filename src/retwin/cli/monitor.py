@@ -55,7 +55,7 @@ EQUATIONS = (
     "Written as a StateTwin (docs/twins.md#states) and fitted with --dynamics, the twin itself is "
     "watched, and causes are its parameters too."
 )
-"""What is said of a model whose outputs are corrected."""
+"""What would watch the twin itself, where a black box takes its place."""
 EVENT = ("file", "record", "from s", "to s", "what", "cause")
 """What is shown of an event."""
 CONFIG = Path("monitor.toml")

@@ -56,10 +56,11 @@ UNSTABLE = (
 """What is said where candidates were judged over a shorter time than was asked for."""
 
 IDENTIFIED = (
-    "The parameters of the twin were identified by these records, so that the twin as it is has "
-    "seen all of them: it is judged with parameters that are identified without each part."
+    "The parameters of the twin were identified by these records: no part that is left out is new "
+    "to the twin as it is. In its place, parameters that are identified without each part are "
+    "scored."
 )
-"""What is said in place of the errors of a twin that has seen the parts that are left out."""
+"""Why the twin as it is has no row in the comparison."""
 
 
 @one_thread()  # fits are small, and threads that wait for each other take longer

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 FOLLOWS = "the twin follows again: the fault is over, or does not show now"
+"""How an event ends after which the machine is as before."""
 CHANGED = "changed"
-"""How an event ends."""
+"""How an event ends after which the machine of now is followed."""
 CERTAIN = 0.05
 """Probability of more evidence than samples over this: for a change in a healthy machine, and for a
 healthy machine while the change lasts."""
