@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 FOLLOWS = "the twin follows again: the fault is over, or does not show now"
-"""How an event ends after which the machine is as before."""
+"""How an event ends where the predictions agree with the machine again."""
 CHANGED = "changed"
-"""How an event ends after which the machine of now is followed."""
+"""How an event ends that lasts: the machine is followed from where it is now."""
 CERTAIN = 0.05
 """Probability of more evidence than samples over this: for a change in a healthy machine, and for a
 healthy machine while the change lasts."""

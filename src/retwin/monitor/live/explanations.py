@@ -103,7 +103,7 @@ class Explanations:
         self._alarms: dict[str, tuple[list[Entry], Entry | None]] = {}
         """Of each machine the alarms that its event is explained by, and the newest one."""
         self._current: dict[tuple[str, int], tuple[str, float]] = {}
-        """The cause of each event, by its machine and time, and the probability that there is more."""
+        """Of each machine and event its cause, and the probability that there is more to it."""
         self._closed = threading.Event()
         self._taking = threading.Lock()
         self._last = -1
