@@ -72,6 +72,15 @@ def test_an_oscillation_needs_the_second_order() -> None:
         assert (abs(np.mean(errors[:, 1:] * errors[:, :-1])) < 0.1) == white
 
 
+@pytest.mark.slow
+def test_residuals_that_alternate_and_persist_are_made_white() -> None:
+    """As where a filter follows too fast: a slow autoregression with white noise does not fit."""
+    fast, slow = np.random.default_rng(2).normal(size=(2, 4, 2000))
+    values = 20 + lfilter([1, -0.5], [1], fast) + 0.1 * lfilter([1], [1, -0.98], slow)
+    errors = fit_disturbance(values, folds=2).held_out
+    assert abs(np.mean(errors[:, 1:] * errors[:, :-1])) < 0.05
+
+
 def test_bytes_do_not_depend_on_grouping(slow: tuple[NDArray, Disturbance]) -> None:
     values, model = slow
     whole, errors, _ = model.run(model.start(), values[:, :50])

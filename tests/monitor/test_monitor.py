@@ -401,15 +401,40 @@ def test_evidence_is_the_mean_of_two_models(
     twin: DynamicsTwin, monitor: Monitor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert len(monitor.slack) == 2 * len(twin.outputs)
-    assert [each.process for each in monitor.predictors] == [1.0, SLOWER]
+    assert [each.process for each in monitor.predictors] == [1.0, SLOWER[0]]
     assert "slower" in str(monitor.promises["pressure"])
-    monkeypatch.setattr("retwin.monitor.models.fitting.SLOWER", 1.0)  # the same model twice
+    monkeypatch.setattr("retwin.monitor.models.fitting.SLOWER", (1.0,))  # the same model twice
     twice = fit_monitor(twin, record(2, 1), "1 per hour")
     monkeypatch.setattr("retwin.monitor.models.fitting._slower", lambda *_: [])
     once = fit_monitor(twin, record(2, 1), "1 per hour")
     found = [each.watch(leaking()) for each in (once, twice)]
     np.testing.assert_allclose(found[1].evidence, found[0].evidence, rtol=1e-9)
     assert [each.time for each in found[0].alarms] == [each.time for each in found[1].alarms]
+
+
+@pytest.mark.slow
+def test_the_slower_model_follows_as_fast_as_a_disturbance_demands(
+    twin: DynamicsTwin, monitor: Monitor
+) -> None:
+    """A level that wanders: by the equations alone it is tens of deviations from predicted."""
+    record_of = record(2, 1)
+    walk = np.cumsum(np.random.default_rng(3).normal(size=record_of.observed.shape), axis=1)
+    wanders = record_of.replace(observed=record_of.observed + 0.05 * walk)
+    slower = [each.process for each in fit_monitor(twin, wanders).predictors[1:]]
+    assert slower != [SLOWER[0]]
+    assert [each.process for each in monitor.predictors[1:]] == [SLOWER[0]]
+
+
+def test_slack_is_widened_where_variance_clusters() -> None:
+    """Marginally Gaussian scores whose size persists, which no single alarm contradicts yet."""
+    rng = np.random.default_rng(0)
+    sizes = np.repeat(rng.permutation(np.linspace(0.5, 1.5, 60)), 50)
+    scores = np.stack([rng.normal(size=3000), rng.normal(size=3000) * sizes])
+    scores[1] /= scores[1].std()
+    given = (Slack(1.1, 0.1), Slack(1.1, 0.1))
+    first, second = agreeing(given, [(scores[:, :1500],) * 2, (scores[:, 1500:],) * 2])
+    assert first == given[0]
+    assert second.kappa > 1.15
 
 
 def test_slack_is_widened_where_the_calibration_contradicts_it() -> None:

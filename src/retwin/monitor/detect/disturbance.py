@@ -19,6 +19,8 @@ LARGEST_PARTIAL = 0.9995
 GRID = [(a, b) for a in (-0.5, 0.2, 0.8, 1.4, 2.0, 2.6, 3.2) for b in (-8.0, -3.0, -1.0, 1.0, 3.0)]
 """First values of the inverse hyperbolic tangent of a partial autocorrelation, and of the logarithm
 of the ratio of variances of measurement and process noise."""
+ORDERS = (2, 3, 6)
+"""Orders that are tried after the first."""
 ROUNDS = 14
 """Rounds of the pattern search; a failed one halves the step of a stream."""
 RATIOS = (-12.0, 12.0)
@@ -129,7 +131,7 @@ class Disturbance:
 
 
 def fit_disturbance(
-    residual: ArrayLike, *, max_order: int = 3, folds: int | Sequence[NDArray] = 4
+    residual: ArrayLike, *, max_order: int = 6, folds: int | Sequence[NDArray] = 4
 ) -> Disturbance:
     """Estimate the autoregression of residuals of a healthy machine, by maximum likelihood.
 
@@ -329,16 +331,48 @@ def _orders(blocks: NDArray, max_order: int) -> NDArray:
     first = np.argmin(_likelihood(blocks, grid)[0], axis=0)
     point, best = _search(blocks, grid[:, first, np.arange(streams)], ROUNDS)
     penalty = np.log(np.sum(~np.isnan(blocks), axis=(0, 1)))
-    kept, orders = point, np.ones(streams)
-    for _ in range(1, max_order):
-        wider = np.insert(point, len(point) - 1, 0.0, axis=0)
-        point, found = _search(blocks, wider, ROUNDS)
-        kept = np.insert(kept, len(kept) - 1, 0.0, axis=0)
-        better = found + penalty < best
-        orders = np.where(better, len(point) - 1, orders)
-        kept, best = np.where(better, point, kept), np.where(better, found + penalty, best)
+    kept, orders, best = point, np.ones(streams), best + penalty
+    partial = _partial(blocks, max_order)
+    for order in (each for each in ORDERS if each <= max_order):
+        # The likelihood has two maxima: with much measurement noise, and with hardly any.
+        free = np.concatenate([partial[:order], np.full((1, streams), GRID[0][1])])
+        both = [_search(blocks, each, ROUNDS) for each in (_of_order(point, order), free)]
+        (point, found), (other, others) = both
+        point, found = np.where(others < found, other, point), np.minimum(others, found)
+        better = found + penalty * order < best
+        orders = np.where(better, order, orders)
+        kept = np.where(better, point, _of_order(kept, order))
+        best = np.where(better, found + penalty * order, best)
     top = int(orders.max())
     return np.concatenate([kept[:top], kept[-1:]])
+
+
+def _of_order(point: NDArray, order: int) -> NDArray:
+    """A point of a smaller order, (order + 1, streams)."""
+    more = np.zeros((order + 1 - len(point), point.shape[1]))
+    return np.concatenate([point[:-1], more, point[-1:]])
+
+
+def _partial(blocks: NDArray, order: int) -> NDArray:
+    """Inverse hyperbolic tangents (order, streams) of the sample partial autocorrelations."""
+    seen = np.isfinite(blocks)
+    filled, size = np.where(seen, blocks, 0.0), len(blocks)
+    sums, pairs = (
+        np.array([(each[i:] * each[: size - i]).sum(axis=(0, 1)) for i in range(order + 1)])
+        for each in (filled, seen)
+    )
+    correlation = sums / np.maximum(pairs, 1)
+    made, variance = np.zeros_like(correlation[1:]), correlation[0].copy()
+    coefficients = made[:0]
+    for k in range(order):  # Levinson's recursion
+        error = correlation[k + 1] - (coefficients * correlation[k:0:-1]).sum(axis=0)
+        made[k] = np.clip(error / variance, -0.99, 0.99)
+        variance *= 1 - made[k] ** 2
+        coefficients = np.concatenate(
+            [coefficients - made[k] * coefficients[::-1], made[k : k + 1]]
+        )
+    found: NDArray = np.arctanh(made / LARGEST_PARTIAL)
+    return found
 
 
 def _standardised(values: NDArray, point: NDArray, scale: NDArray) -> NDArray:

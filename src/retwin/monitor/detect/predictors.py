@@ -22,7 +22,7 @@ from retwin.update.dynamics.filter.online import FilterState, OnlineFilter
 from retwin.update.dynamics.filter.prediction import root_of, whitened
 from retwin.update.dynamics.twin import DynamicsTwin
 
-SLOWER = 1e-4
+SLOWER = (1e-4, 1e-3, 1e-2, 1e-1)
 """Factor of the variance of the process noise of the second model, whose filter needs about a
 hundred times as long to follow. Not 0: states that integrate would drift away for ever."""
 
@@ -35,6 +35,8 @@ SETTLED = 1.05
 which the filter knows the states of a machine that it did not see start."""
 WIDER = 1.25 ** np.arange(1, 17)
 """Factors of the slack of which the first is taken with which the calibration agrees."""
+WINDOWS = 16
+"""Windows of successive samples that the calibration contains at least, for their mean product."""
 
 
 @dataclass(frozen=True)
@@ -128,8 +130,10 @@ def agreeing(
     """Slacks that are widened until the calibration itself does not contradict them.
 
     Within the class, the evidence of a detector reaches n / alpha in n samples with a probability
-    of at most alpha. Held-out errors of the calibration that reach it, since they are more
-    dependent than their number of parameters lets expect or another day's, are not of that class.
+    of at most alpha, and the product of an alternative's bets over any number of successive samples
+    has a mean of at most 1. Held-out errors of the calibration for which that is not so, since they
+    are more dependent than their number of parameters lets expect, or their variance clusters, or
+    they are another day's, are not of that class.
 
     Parameters
     ----------
@@ -138,7 +142,7 @@ def agreeing(
     parts : sequence of tuple of ndarray
         Scores of parts of the calibration, each left out of what they were ranked among.
     alpha : float
-        Probability of widening where it is not needed, for each stream.
+        Probability with which the evidence widens where it is not needed, for each stream.
 
     """
     made = list(slacks)
@@ -151,10 +155,30 @@ def agreeing(
             limit = np.isfinite(low[wrong]).sum(axis=1) * len(parts) / alpha
             _, evidence = detector.run(detector.start(len(wrong)), low[wrong], high[wrong])
             above |= evidence.max(axis=1) >= np.maximum(limit, 1.0)
+        above |= _bets_win(detector, [(low[wrong], high[wrong]) for low, high in parts])
         wrong = [i for i, each in zip(wrong, above, strict=True) if each]
         if not wrong:
             break
     return tuple(made)
+
+
+def _bets_win(detector: Detector, parts: Sequence[Scored]) -> NDArray:
+    """Streams with an alternative whose bets over successive samples have a mean product above 1.
+
+    All lengths that the parts contain `WINDOWS` times are tried, in powers of two.
+    """
+    first = np.zeros(len(detector.which))
+    logs = []
+    for low, high in parts:
+        factors = detector.factors(first, *detector.intervals(first, low, high))
+        logs.append(np.cumsum(np.log([factor for factor, _, _ in factors]), axis=0))
+    made = np.zeros(len(first), dtype=bool)
+    length, longest = 1, sum(len(each) for each in logs) // WINDOWS
+    while length <= longest:
+        products = [np.exp(each[length:] - each[:-length]) for each in logs]
+        made |= (np.concatenate(products).mean(axis=0) > 1 + 1e-9).any(axis=0)
+        length *= 2
+    return made
 
 
 def finite_state(online: OnlineFilter, state: FilterState) -> FilterState:

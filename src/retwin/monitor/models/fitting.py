@@ -44,6 +44,8 @@ other."""
 EFFECTS = (1.0, 3.0, 10.0)
 """Posterior deviations by which machines or days may differ from the twin, of which the one with
 the largest density of the calibration is taken, each sample predicted from those before."""
+LARGEST_VARIANCE = 10.0
+"""Mean square of standardised errors up to which a slower model describes the machine."""
 FOLDS = 8
 """Parts of the calibration that are left out in turn, at most."""
 
@@ -153,10 +155,13 @@ def _slower(
     """The model that follows slowly, where it is another one and settles within the records."""
     if not (twin.process.any() or twin.proportional.any()):
         return []
-    found = _calibrated(twin, Predictor(SLOWER), healthy, measured, steps)
-    if found is None or found.predictor.warm_up * twin.rate >= healthy.steps // 2:
-        return []
-    return [found]
+    for factor in SLOWER:
+        found = _calibrated(twin, Predictor(factor), healthy, measured, steps)
+        if found is None or found.predictor.warm_up * twin.rate >= healthy.steps // 2:
+            continue
+        if np.nanmean(found.error**2) <= LARGEST_VARIANCE:
+            return [found]
+    return []
 
 
 def _calibrated(
