@@ -147,7 +147,7 @@ def test_bands_hold_what_they_promise_of_other_records() -> None:
 
 
 @pytest.mark.slow
-def test_bands_hold_where_records_begin_in_other_states() -> None:
+def test_bands_hold_where_records_begin_in_other_states(tmp_path: Path) -> None:
     """The band is wide at the start alone: its mean square says nothing of the time after it."""
     twin = twin_of()
     states = (State("heat", "K", low=-20.0, high=20.0),)
@@ -168,6 +168,18 @@ def test_bands_hold_where_records_begin_in_other_states() -> None:
     held = predict_records(found.twin, fresh)
     later = np.abs(fresh.observed - held.mean)[:, 60:] <= 1.645 * held.deviation[:, 60:]
     assert later.mean() > 0.85
+    # From starts that their first samples give, they are predicted from the start on.
+    found.twin.save(tmp_path / "model")
+    for model in (found.twin, rt.load_twin(tmp_path / "model")):
+        started = predict_records(model, fresh, started=10.0)
+        error, usual = (np.abs(fresh.observed - e.mean)[:, 10:] for e in (started, held))
+        assert np.std(error) < 0.5 * np.std(usual)
+        assert np.mean(error <= 1.645 * started.deviation[:, 10:]) > 0.8
+        assert np.mean(started.deviation) < np.mean(held.deviation[:, :30])
+    rows = rt.score_model(found.twin, fresh, warm_up=10.0, started=10.0, twin=twin.parametric())
+    errors = {each.who: each.rmse for each in rows}
+    (model, *_) = rt.score_model(found.twin, fresh, warm_up=10.0)
+    assert errors["model"] < min(0.5 * model.rmse, errors["twin"])
 
 
 @pytest.mark.slow

@@ -19,9 +19,10 @@ from retwin.cli.options import (
     Model,
     OtherCase,
     Seed,
+    WarmUp,
     argument,
+    leave_out,
     option,
-    rare,
     seconds_of,
 )
 from retwin.cli.plans import Workers, carry_out
@@ -34,6 +35,7 @@ from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
     from retwin.evaluation.choice.scoring import ModelScore, ScoredPrediction
+    from retwin.twins.twin import Twin
 
 
 def generate(
@@ -49,6 +51,7 @@ def generate(
     case: OtherCase = None,
     seed: Seed = 0,
     workers: Workers = None,
+    warm_up: WarmUp = "",
     mapping: LogMapping = None,
 ) -> None:
     """Generate trajectories, or predictions of commands.
@@ -68,8 +71,10 @@ def generate(
     if bands:
         check_place(out)
         check_place(out.with_suffix(".png"))
-        _write_bands(model, commands, out, case, seed, mapping)  # type: ignore[arg-type]
+        begin = seconds_of("--warm-up", warm_up or "free") or 0.0
+        _write_bands(model, commands, out, case, seed, mapping, begin)  # type: ignore[arg-type]
         return
+    leave_out({"--warm-up": warm_up or None}, "without --bands")
     kind = check_target(out)
     updated, system = source_of(model, case)
     if commands is not None:
@@ -91,7 +96,13 @@ def generate(
 
 
 def _write_bands(
-    model: Path, commands: Path, out: Path, case: str | None, seed: int, mapping: Path | None
+    model: Path,
+    commands: Path,
+    out: Path,
+    case: str | None,
+    seed: int,
+    mapping: Path | None,
+    begin: float,
 ) -> None:
     """Mean and quantiles of every sample of given commands, as a table and of one as a picture."""
     from retwin.evaluation import predict_records
@@ -100,7 +111,7 @@ def _write_bands(
 
     updated, system = source_of(model, case)
     records = read_commands(commands, system, mapping=mapping)
-    found = predict_records(updated, records, seed=seed)
+    found = predict_records(updated, records, started=begin, seed=seed)
     write_predictions(found, records, out)
     picture = png(draw_prediction(records, found.mean, found.deviation), emulated=records.emulated)
     with write_atomically(out.with_suffix(".png")) as part:
@@ -131,7 +142,7 @@ def evaluate(
     model: Model,
     real: Annotated[list[Path], option("FILE", "Records it was not fitted to; may be repeated.")],
     horizon: Horizon = "free",
-    warm_up: Annotated[str, rare("TIME", "Begin of each record that is not scored, as 5s.")] = "",
+    warm_up: WarmUp = "",
     out: Annotated[Path | None, option("FILE", "CSV file of predictions with bands.")] = None,
     case: OtherCase = None,
     seed: Seed = 0,
@@ -143,23 +154,29 @@ def evaluate(
     from retwin.evaluation import predict_records, score_model
 
     ahead = seconds_of("--horizon", horizon)
-    skipped = (seconds_of("--warm-up", warm_up) if warm_up else None) or 0.0
+    begin = seconds_of("--warm-up", warm_up or "free") or 0.0
     if out is not None:
         check_place(out)
     updated = updated_twin(model)
     system = system_of(updated, model, case)
     records = read(real, system, part="test", max_bytes=max_bytes, mapping=mapping)
     scores = score_model(
-        updated, records, horizon=ahead, warm_up=skipped, twin=system.twin, seed=seed
+        updated,
+        records,
+        horizon=ahead,
+        warm_up=begin,
+        started=begin,
+        twin=system.twin,
+        seed=seed,
     )
     if out is not None:
-        found = predict_records(updated, records, horizon=ahead, seed=seed)
+        found = predict_records(updated, records, horizon=ahead, started=begin, seed=seed)
         write_predictions(found, records, out)
     units = dict(zip(records.outputs.names, records.outputs.units, strict=True))
     rows = [
         (
             each.output,
-            each.who,
+            each.who if ahead is None or each.who != "twin" else "twin + last error",
             f"{each.rmse:.4g}",
             f"{each.crps:.4g}",
             f"{each.coverage:.0%}" if isfinite(each.coverage) else "–",
@@ -176,12 +193,37 @@ def evaluate(
         f"{count}, {how}:",
         table(heads, rows, numbers=heads[2:6]),
         *_verdict(scores),
+        *([] if ahead or begin else _start_remarks(updated, records, units, seed)),
         as_json=as_json,
     )
     if out is not None:
         note(f"Wrote predictions to {out}")
 
 
+def _start_remarks(
+    model: Twin, records: Trajectories, units: dict[str, str], seed: int
+) -> list[str]:
+    """Outputs that are predicted much better from starts that the records themselves give."""
+    from retwin.evaluation import score_model
+    from retwin.update.forecasts import BEGIN, unknown_starts
+
+    if not unknown_starts(model):
+        return []
+    begin = float(f"{records.lengths.max() / records.rate / BEGIN:.1g}")
+    usual, better = (
+        score_model(model, records, warm_up=begin, started=each, seed=seed) for each in (0.0, begin)
+    )
+    return [
+        f"{a.output}: from the start that the first {begin:g} s of each record give, the RMSE "
+        f"after them is {b.rmse:.4g} in place of {a.rmse:.4g} {units[a.output]}: --warm-up "
+        f"{begin:g}s."
+        for a, b in zip(usual, better, strict=True)
+        if a.who == "model" and b.rmse < MUCH * a.rmse
+    ]
+
+
+MUCH = 0.8
+"""Ratio of errors from which starts of records are named."""
 CLEAR = 0.01
 """Part of an error by which another predictor must be better to be mentioned."""
 
@@ -210,6 +252,6 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
                 continue
             made.append(
                 f"{text}: do not rely on it here. These records may be of another day, or begin in "
-                "other states than the twin: identify it without the begin of records, --transient."
+                "other states than the model, which --warm-up infers."
             )
     return made

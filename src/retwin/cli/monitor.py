@@ -508,7 +508,7 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     if events and poisson.sf(events - 1, samples / monitor.run_length) < monitor.alpha:
         text += (
             " More events were seen than it allows: these are faults, or, if the machine was "
-            "healthy, the promise does not hold for it; then calibrate with these records too."
+            "healthy, the promise does not hold for it; only then calibrate with these records too."
         )
     return text
 

@@ -83,6 +83,11 @@ Horizon = Annotated[
     str, option("TIME", "Judge by predictions so far ahead: 1s, free.", "--horizon")
 ]
 
+WarmUp = Annotated[
+    str,
+    rare("TIME", "Begin of each record that gives its start, and is not scored: 5s.", "--warm-up"),
+]
+
 
 def leave_out(options: Mapping[str, object], when: str) -> None:
     """Refuse options that have no meaning `when`; None and False are those that were not given."""

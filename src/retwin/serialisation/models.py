@@ -95,7 +95,7 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
         str(folder),
         expected=f"a {kind} model of schema {SCHEMA}",
         got=f"kind {found[1]!r}, schema {found[0]!r}",
-        remedy=REMEDY,
+        remedy=f"{REMEDY}; rt.load_twin reads what `retwin fit` saved, of any kind",
     )
     return about, weights
 

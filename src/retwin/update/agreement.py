@@ -16,6 +16,8 @@ from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
 from retwin.twins.twin import Twin
+from retwin.twins.wrappers.parametric import ParametricTwin
+from retwin.update.dynamics.windows import simulated as simulated_outputs
 
 CLEAR = 0.5
 """Ratio of residuals from which exchanged commands are named."""
@@ -50,9 +52,15 @@ def check_with_twin(twin: Twin | None, records: Trajectories) -> Checked:
 
 
 def simulated(twin: Twin, records: Trajectories) -> NDArray | None:
-    """What a twin simulates for the commands (n, T, d_y); None if it cannot."""
+    """What a twin simulates for the commands (n, T, d_y); None if it cannot.
+
+    Starts of states that the twin does not state are those that fit each record.
+    """
     try:
-        made = twin.simulate(records.commands, seed=0).observed
+        if isinstance(twin, ParametricTwin):
+            made = simulated_outputs(twin, records, records.mask, seed=0, own=True)
+        else:
+            made = twin.simulate(records.commands, seed=0).observed
     except (InputError, SimulationError):
         return None
     return made if np.isfinite(made).all() else None

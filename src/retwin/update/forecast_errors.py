@@ -58,6 +58,9 @@ class ForecastErrors:
         Time in s of the longest record of the calibration; infinite where it is not known.
     drifts : bool
         Whether errors of free simulation depended on the time in the record.
+    started : NDArray or None
+        (d_y,), the deviation of free simulations from starts that the first tenth of each record
+        gives; None for models whose starts are known, or cannot be set.
 
     """
 
@@ -71,6 +74,7 @@ class ForecastErrors:
     beyond: float
     longest: float = np.inf
     drifts: bool = False
+    started: NDArray | None = None
 
     def at(self, lead: float) -> tuple[NDArray, NDArray]:
         """Persistence and deviation (d_y,) of any time ahead in s, interpolated over its log."""
@@ -114,7 +118,8 @@ class ForecastErrors:
         arrays = {name: getattr(self, name).tolist() for name in (*BY_LEAD, "low", "high")}
         longest = self.longest if np.isfinite(self.longest) else None
         times = {"memory": self.memory, "longest": longest, "drifts": self.drifts}
-        return {"leads": leads, **arrays, "beyond": self.beyond, **times}
+        started = None if self.started is None else self.started.tolist()
+        return {"leads": leads, **arrays, "beyond": self.beyond, **times, "started": started}
 
     @classmethod
     def of(cls, values: Mapping[str, Any] | None) -> ForecastErrors | None:
@@ -138,11 +143,18 @@ class ForecastErrors:
             remedy="save the model again",
         )
         memory, beyond = float(values["memory"]), float(values["beyond"])
-        # Models that were saved before have neither of these.
+        # Models that were saved before have none of these.
         longest, drifts = values.get("longest"), bool(values.get("drifts"))
         longest = np.inf if longest is None else float(longest)
+        started = values.get("started")
         return cls(
-            leads=leads, memory=memory, beyond=beyond, longest=longest, drifts=drifts, **arrays
+            leads=leads,
+            memory=memory,
+            beyond=beyond,
+            longest=longest,
+            drifts=drifts,
+            started=None if started is None else np.array(started, dtype=float),
+            **arrays,
         )
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
+from typing import TypeGuard
 
 import numpy as np
 import torch
@@ -14,11 +15,13 @@ from scipy.special import stdtrit
 from retwin.data.trajectories import Trajectories
 from retwin.twins.equations.interpolation import TAPS
 from retwin.twins.twin import Twin
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive
 from retwin.update.dynamics.estimation import correlation_time
 from retwin.update.dynamics.filter.filtering import arrays_of
 from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.windows import simulated
 from retwin.update.forecast_errors import (
     BEYOND,
     LEVEL,
@@ -34,6 +37,8 @@ ORIGINS = 2000
 """Samples from which predictions start, at most, of all trajectories together."""
 LEADS = (1, 3, 10, 30, 100)
 """Samples ahead at which errors are calibrated."""
+BEGIN = 10
+"""The begin of a record is its part by this number."""
 DRIFT = 0.01
 """Probability of a trend of errors over the time in a record that is no chance."""
 FORGOTTEN = 5.0
@@ -64,6 +69,40 @@ def free_moments(twin: Twin, commands: NDArray, *, seed: int = 0) -> tuple[NDArr
         moments.append((drawn.mean(axis=0, dtype=np.float64), drawn.std(axis=0, dtype=np.float64)))
     means, deviations = (np.stack(each) for each in zip(*moments, strict=True))
     return means, deviations
+
+
+def unknown_starts(twin: object) -> TypeGuard[DynamicsTwin]:
+    """Whether a model has states whose starts the begin of a record gives."""
+    return isinstance(twin, DynamicsTwin) and twin.unknown_starts
+
+
+def started_mean(twin: Twin, records: Trajectories) -> NDArray | None:
+    """Means of free simulations from starts by the first tenth of each record; see `LeftOut`."""
+    begin = max(1, int(records.lengths.min()) // BEGIN)
+    if not (unknown_starts(twin) and records.mask[:, :begin].any(axis=(1, 2)).all()):
+        return None
+    mean = started_moments(twin, records, begin / records.rate)[0]
+    mean[:, :begin] = np.nan
+    return mean
+
+
+def started_moments(
+    twin: Twin, records: Trajectories, begin: float, *, seed: int = 0
+) -> tuple[NDArray, NDArray]:
+    """`free_moments` from starts that the first `begin` s of each record give.
+
+    Of twins whose starts are known, or cannot be set, it is `free_moments`.
+    """
+    if unknown_starts(twin):
+        rows = [records[[i]] for i in range(len(records))]
+        pairs = [free_moments(twin.started(e.between(0.0, begin)), e.commands) for e in rows]
+        means, deviations = (np.concatenate(each) for each in zip(*pairs, strict=True))
+        return means, deviations
+    if isinstance(twin, ParametricTwin):
+        used = records.mask & (np.arange(records.steps) < round(begin * records.rate))[:, None]
+        made = simulated(twin, records, used, seed=seed, own=True)
+        return made, np.zeros_like(made)
+    return free_moments(twin, records.commands, seed=seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +200,9 @@ class LeftOut:
         How far their values leave the range of those that the model was fitted to, in widths.
     edge : bool
         Whether they are the largest commands and outputs of all.
+    started : NDArray or None
+        (r, T, d_y), means of free simulations from starts that the first tenth of each record
+        gives, and NaN in that; None for models whose starts are known, or cannot be set.
 
     """
 
@@ -170,6 +212,7 @@ class LeftOut:
     held: NDArray
     excess: float
     edge: bool
+    started: NDArray | None = None
 
 
 def values_of(records: Trajectories) -> NDArray:
@@ -221,7 +264,16 @@ def calibrate_forecasts(
     by_lead = times, persistence, deviation, independent
     longest = float(records.lengths.max() / records.rate)
     drifts = errors_drift(np.concatenate(free))
-    return ForecastErrors(*by_lead, memory, low, high, beyond, longest, drifts)
+    return ForecastErrors(*by_lead, memory, low, high, beyond, longest, drifts, _started(found))
+
+
+def _started(found: Sequence[LeftOut]) -> NDArray | None:
+    """Deviations (d_y,) of simulations from starts that records give; None where there are none."""
+    known = [(each, each.started) for each in found if each.started is not None and not each.edge]
+    if not known:
+        return None
+    errors = [_errors(replace(each, free=mean), len(each.ahead.mean)) for each, mean in known]
+    return np.array([_calibrate(errors, i)[1] for i in range(errors[0][0].shape[2])])
 
 
 def errors_drift(errors: NDArray) -> bool:

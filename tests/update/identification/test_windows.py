@@ -152,8 +152,37 @@ def test_a_start_is_inferred_unless_it_is_given() -> None:
     observed = record(commands, LAG.simulate(commands, seed=0, parameters=given).observed)
     free = identify(LAG.parametric(), observed, QUICK, seed=0)
     assert free.values["gain"] == pytest.approx(GAIN, rel=1e-3)
+    assert not free.own_starts  # a start without bounds is no parameter
     fixed = replace(LAG, states=(State("level", "m", 0.0),)).parametric()
     assert identify(fixed, observed, QUICK, seed=0).values["gain"] != pytest.approx(GAIN, rel=0.05)
+
+
+def test_each_record_has_its_own_start_unless_one_is_stated() -> None:
+    """Bounds of an unknown start make it a parameter, of which records have different values."""
+    commands = np.repeat(np.random.default_rng(0).uniform(-1, 1, (6, 8, 1)), 25, axis=1)
+    starts = np.array([1.5, -2.0, 0.5, 2.5, -1.0, 0.0])
+    given = {"gain": np.full(6, GAIN), "start_level": starts}
+    observed = record(commands, LAG.simulate(commands, seed=0, parameters=given).observed)
+    bounded = replace(LAG, states=(State("level", "m", None, -5.0, 5.0),)).parametric()
+    used, held_out = hold_out(observed, 0.25, seed=0)
+    found = identify(bounded, used, QUICK, seed=0)
+    assert found.values["gain"] == pytest.approx(GAIN, rel=1e-3)
+    own = starts[np.isin(observed.commands[:, 0, 0], used.commands[:, 0, 0])]
+    assert found.values["start_level"] == pytest.approx(own.mean(), abs=0.01)
+    assert found.own_starts == {"start_level": pytest.approx(own.std(), abs=0.01)}
+    assert [*found.intervals] == ["gain"]
+    judged = validate_identification(found, bounded, used, held_out, seed=0)
+    assert judged.errors("validation")["y"].after < 1e-3
+    assert [(each.name, each.own) for each in judged.parameters] == [
+        ("gain", False),
+        ("start_level", True),
+    ]
+    assert judged.open_parameters == ()
+    assert "Each record has its own start_level" in " ".join(findings(judged))
+    stated = replace(LAG, states=(State("level", "m", 0.0, -5.0, 5.0),)).parametric()
+    shared = identify(stated, used, QUICK, seed=0)
+    assert not shared.own_starts
+    assert [*shared.intervals] == ["gain", "start_level"]
 
 
 @pytest.mark.parametrize("horizon", [None, 2.0])

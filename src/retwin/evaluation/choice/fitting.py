@@ -43,6 +43,7 @@ from retwin.update.forecasts import (
     calibrate_forecasts,
     forecasts,
     free_moments,
+    started_mean,
 )
 from retwin.update.residual.fitting import calibrating
 from retwin.update.residual.priors import other_machines
@@ -266,7 +267,8 @@ def _calibrate(model: Model, trials: Trials, name: str, comparison: Comparison) 
         own = records[fold.rows]
         free = free_moments(one, own.commands)[0]
         part = (forecasts(one, own, leads), free, own, fold.held[fold.rows])
-        found.append(LeftOut(*part, fold.excess(records), fold.edge))
+        excess, started = fold.excess(records), started_mean(one, own)
+        found.append(LeftOut(*part, excess, fold.edge, started))
     forecast = calibrate_forecasts(records, found, leads)
     constant = comparison.constant[name]
     if constant.any():

@@ -14,7 +14,7 @@ from retwin.scores.distributions import crps_normal
 from retwin.scores.intervals import grouped_share_interval
 from retwin.twins.twin import Twin, check_channels
 from retwin.update.forecast_errors import USUAL, ForecastErrors
-from retwin.update.forecasts import forecasts, free_moments
+from retwin.update.forecasts import forecasts, free_moments, started_moments
 from retwin.update.training_range import OutsideTrainingWarning
 
 
@@ -25,8 +25,9 @@ class ModelScore:
     Attributes
     ----------
     who : str
-        "model"; "twin", as it was before; "mean", that of the record itself; or "hold", the last
-        sample measured before the horizon, of free simulation the first one of the record.
+        "model"; "twin", as it was before, with a horizon plus its last error before that; "mean",
+        that of the record itself; or "hold", the last sample measured before the horizon, of free
+        simulation the first one of the record.
     output : str
         Name of the output.
     horizon : float or None
@@ -69,7 +70,12 @@ class ScoredPrediction:
 
 
 def predict_records(
-    model: Twin, records: Trajectories, *, horizon: float | None = None, seed: int = 0
+    model: Twin,
+    records: Trajectories,
+    *,
+    horizon: float | None = None,
+    started: float = 0.0,
+    seed: int = 0,
 ) -> ScoredPrediction:
     """The distribution of each sample, by free simulation or from measurements `horizon` s before.
 
@@ -81,6 +87,9 @@ def predict_records(
         Commands, and measured outputs, which are used up to `horizon` before each sample.
     horizon : float, optional
         Time ahead in s; by default free simulation, which uses no measured output.
+    started : float
+        Time in s at the begin of each record by whose measured outputs a free simulation infers the
+        start of the states, where it is unknown; 0 is none.
     seed : int
         Of draws.
 
@@ -96,7 +105,9 @@ def predict_records(
     check_channels(model, records, "records")
     errors: ForecastErrors | None = getattr(model, "forecast", None)
     if horizon is None:
-        mean, deviation = free_moments(model, records.commands, seed=seed)
+        mean, deviation = _simulated(model, records, started, seed)
+        if started and errors is not None and errors.started is not None:
+            deviation = np.broadcast_to(errors.started, mean.shape)
     else:
         ahead = max(1, round(positive("horizon", horizon) * records.rate))
         require(
@@ -119,6 +130,16 @@ def predict_records(
         outside |= late & errors.drifts
         deviation = np.where(outside[..., None], np.nan, deviation)
     return ScoredPrediction(mean, deviation)
+
+
+def _simulated(
+    model: Twin, records: Trajectories, started: float, seed: int
+) -> tuple[NDArray, NDArray]:
+    """Means and deviations of free simulations, with starts by the first measurements or not."""
+    begin = finite("started", started, at_least=0.0, unit="s")
+    if begin:
+        return started_moments(model, records, begin, seed=seed)
+    return free_moments(model, records.commands, seed=seed)
 
 
 def _warn_outside(outside: NDArray, records: Trajectories) -> None:
@@ -161,6 +182,7 @@ def score_model(
     *,
     horizon: float | None = None,
     warm_up: float = 0.0,
+    started: float = 0.0,
     twin: Twin | None = None,
     seed: int = 0,
 ) -> list[ModelScore]:
@@ -177,6 +199,8 @@ def score_model(
         default free simulation from the commands.
     warm_up : float
         Time in s at the begin of each record that is not scored.
+    started : float
+        See `predict_records`.
     twin : Twin, optional
         The twin before its update, which is scored too.
     seed : int
@@ -195,7 +219,7 @@ def score_model(
 
     """
     skipped = round(finite("warm_up", warm_up, at_least=0.0) * records.rate)
-    found = predict_records(model, records, horizon=horizon, seed=seed)
+    found = predict_records(model, records, horizon=horizon, started=started, seed=seed)
     seen = records.mask & np.isfinite(found.mean)
     seen[:, :skipped] = False
     require(
@@ -209,7 +233,12 @@ def score_model(
     predictions = {"model": found}
     if twin is not None:
         nothing = np.full(measured.shape, np.nan)
-        predictions["twin"] = ScoredPrediction(free_moments(twin, records.commands)[0], nothing)
+        if horizon is None:
+            mean = _simulated(twin, records, started, seed)[0]
+        else:
+            made = forecasts(twin, records, [max(1, round(horizon * records.rate))])
+            mean = made.mean[0] + made.last[0]
+        predictions["twin"] = ScoredPrediction(mean, nothing)
     predictions |= _baselines(records, horizon)
     rows = []
     for who, each in predictions.items():

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from retwin.twins.wrappers.parametric import ParametricTwin
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
 from retwin.update.identification.identifiability import UNIFORM
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.posterior import Posterior
@@ -55,6 +55,9 @@ class ParameterEstimate:
     depends : bool
         Whether its value depends on the bound of another parameter: without bounds it would move by
         more than half of its 95 % interval.
+    own : bool
+        Whether it is a start of which each record has its own: `value` is their mean, and `error`
+        their standard deviation.
 
     """
 
@@ -69,6 +72,7 @@ class ParameterEstimate:
     identified: bool
     at_bound: Literal["low", "high", ""]
     depends: bool = False
+    own: bool = False
 
     @property
     def covered(self) -> float | None:
@@ -96,7 +100,7 @@ def spread_of(parameters: Sequence[ParameterEstimate]) -> float:
     """
     shares = [SMALLEST]
     for each in parameters:
-        if each.at_bound:
+        if each.at_bound or each.own:
             continue
         if not each.identified or each.interval is None:
             return 1.0
@@ -141,11 +145,15 @@ def uncertainty_of(before: ParametricTwin, found: Updated | Posterior) -> Uncert
 
 
 def _of_fit(before: ParametricTwin, found: Updated) -> Uncertainty:
-    """By the curvature at the optimum."""
-    local = found.identifiability
+    """By the curvature at the optimum; starts that each record has for itself are no part of it."""
+    local, names = found.identifiability, before.names
+    pairs = list(zip(before.parameters, before.values, strict=True))
+    starts = [each for each in pairs if each[0].name in found.own_starts]
+    shared, known = zip(*(each for each in pairs if each not in starts), strict=True)
+    before = replace(before, parameters=shared, values=known)
     errors = np.array(list(found.errors.values()))
-    values = np.array(list(found.values.values()))
-    intervals = np.array(list(found.intervals.values()))
+    values = np.array([found.values[name] for name in local.names])
+    intervals = np.array(list(found.intervals.values())).reshape(-1, 2)
     basis: Basis = "trajectories"
     if np.isnan(errors).any():
         basis, errors = "samples", np.asarray(local.errors, dtype=float)
@@ -160,8 +168,20 @@ def _of_fit(before: ParametricTwin, found: Updated) -> Uncertainty:
     bound = local.at_bound & np.isfinite(local.errors)
     sides = [end if at else "" for end, at in zip(ends, bound, strict=True)]
     about = values, errors, intervals, local.identified, sides
-    made = estimates(before, *about, depends=local.depends)
-    return Uncertainty(made, local.correlation, directions, basis)
+    made = {each.name: each for each in estimates(before, *about, depends=local.depends)}
+    made |= {each.name: _own_start(each, at, found) for each, at in starts}
+    places = [names.index(name) for name in local.names]
+    correlation = np.full((len(names), len(names)), np.nan)
+    correlation[np.ix_(places, places)] = local.correlation
+    return Uncertainty(tuple(made[name] for name in names), correlation, directions, basis)
+
+
+def _own_start(parameter: Parameter, before: float, found: Updated) -> ParameterEstimate:
+    """A start of which each record has its own."""
+    name = parameter.name
+    about = name, parameter.unit, parameter.low, parameter.high, before
+    error = found.own_starts[name]
+    return ParameterEstimate(*about, found.values[name], error, None, True, "", own=True)
 
 
 def _of_posterior(

@@ -22,12 +22,11 @@ from retwin.scores.residuals import decorrelated_after
 from retwin.twins.twin import checked_stride
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.windows import simulated as simulated_outputs
+from retwin.update.forecasts import BEGIN
 from retwin.update.identification.horizon import predictions
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.posterior import Posterior
 
-BEGIN = 10
-"""The begin of a trajectory is its part by this number."""
 Part = Literal["identification", "validation"]
 Split = Literal["trajectories", "time", "none"]
 
@@ -228,7 +227,8 @@ def validate_identification(
     simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]] = {}
     for part, measured in parts.items():
         checked_stride(before, measured, None, part)
-        simulated[part] = _simulate(before, mean, measured, used, horizon, seed)
+        own = isinstance(found, Updated) and bool(found.own_starts)
+        simulated[part] = _simulate((before, mean), measured, used, horizon, seed=seed, own=own)
     last = simulated["validation" if held_out is not None else "identification"]
     return Identification(
         twin=mean,
@@ -242,12 +242,13 @@ def validate_identification(
 
 
 def _simulate(
-    before: ParametricTwin,
-    after: ParametricTwin,
+    twins: tuple[ParametricTwin, ParametricTwin],
     measured: Trajectories,
     used: Trajectories,
     horizon: float,
+    *,
     seed: int,
+    own: bool,
 ) -> tuple[Trajectories, NDArray, NDArray]:
     """Measurements, and outputs before and after: free, or predicted over a horizon in s.
 
@@ -255,19 +256,15 @@ def _simulate(
     or the first tenth of those that were held out as a whole.
     """
     if np.isfinite(horizon):
-        made = [
-            predictions(twin, measured, round(horizon * measured.rate)) for twin in (before, after)
-        ]
+        made = [predictions(twin, measured, round(horizon * measured.rate)) for twin in twins]
         outputs = [measured.observed - error for error, _ in made]
         return measured.replace(mask=made[0][1]), outputs[0], outputs[1]
     known = used.mask
     if _split(used, measured) == "trajectories":
         begin = np.arange(measured.steps) < np.maximum(measured.lengths[:, None] // BEGIN, 2)
         known = measured.mask & begin[..., None]
-    first, second = (
-        simulated_outputs(twin, measured, known, seed=seed) for twin in (before, after)
-    )
-    return measured, first, second
+    before, after = (simulated_outputs(twin, measured, known, seed=seed, own=own) for twin in twins)
+    return measured, before, after
 
 
 def _split(used: Trajectories, held_out: Trajectories | None) -> Split:

@@ -7,10 +7,11 @@ from math import isfinite, isnan
 
 from retwin.cases.matching import CONSTANT
 from retwin.evaluation.identification.parameters import WIDEST, Direction, ParameterEstimate
-from retwin.evaluation.identification.validation import BEGIN, Identification, RMSError
+from retwin.evaluation.identification.validation import Identification, RMSError
 from retwin.report.assets import sentences
 from retwin.report.labels import behind, signed, significant
 from retwin.update.dynamics.windows import state_based
+from retwin.update.forecasts import BEGIN
 from retwin.update.identification.posterior import Posterior
 
 WHITE = 0.01
@@ -25,6 +26,8 @@ ELSEWHERE = 2.0
 """Ratio of the errors at the begin of trajectories and later, from which it is named."""
 STRONG = 0.95
 """Correlation of two estimates from which they are named."""
+OWN_START = "mean of the records"
+"""What a start is of which each record has its own."""
 MISFIT = 0.02
 """Prior predictive p-value below which measurements do not fit the twin."""
 
@@ -48,6 +51,8 @@ def interval(each: ParameterEstimate) -> str:
 
 def state(each: ParameterEstimate) -> str:
     """What is wrong with an estimate; "" if nothing is."""
+    if each.own:
+        return OWN_START
     if each.at_bound:
         return "at its lower bound" if each.at_bound == "low" else "at its upper bound"
     if each.identified:
@@ -163,6 +168,7 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
         larger=[pair for pair in found.begin_errors.items() if pair[1] > ELSEWHERE],
         tenth=measured.lengths.max() / measured.rate / BEGIN,
         started=any(each.name.startswith("start_") for each in found.parameters),
+        own=[each.name for each in found.parameters if each.own],
         unknown=unknown,
         undetermined=[p for p in unknown if not (p.leaves and (p.covered or 0.0) <= WIDEST)],
         depending=[each.name for each in found.parameters if each.depends],

@@ -27,7 +27,8 @@ class State:
         for all trajectories or one for each, can be given to `simulate` as the parameter
         `start_NAME`.
     low, high : float, optional
-        Bounds of an unknown start, which is then a free parameter of `StateTwin.parametric`.
+        Bounds of an unknown start, which is then a free parameter of `StateTwin.parametric`. With a
+        `start` beside them, `identify` takes it as the same in all records; else each has its own.
 
     Raises
     ------

@@ -27,7 +27,7 @@ from retwin.update.dynamics.filter.prediction import Prediction
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.saved import KIND, read_fields, write_fields
 from retwin.update.dynamics.simulation import FreeSimulation
-from retwin.update.dynamics.unknowns import unknowns_of
+from retwin.update.dynamics.unknowns import Unknowns, unknowns_of
 from retwin.update.forecast_errors import ForecastErrors
 from retwin.update.training_range import OutsideTrainingWarning
 
@@ -179,8 +179,7 @@ class DynamicsTwin(TwinWrapper):
 
         """
         check_channels(self, record, "record")
-        present = dict(zip(self.equations.names, self.values.tolist(), strict=True))
-        unknowns = unknowns_of(self.equations, (), present)
+        unknowns = self._starts
         require(
             len(record) == 1 and record.mask.any() and len(unknowns.free) > 0,
             "record",
@@ -201,6 +200,17 @@ class DynamicsTwin(TwinWrapper):
         own[len(values) - states + unknowns.free] = root(estimation.covariance(found))
         factor = np.concatenate([factor, own], axis=1)
         return replace(self, values=values, factor=factor, start_deviation=np.zeros(states))
+
+    @property
+    def unknown_starts(self) -> bool:
+        """Whether it has a state whose start is not known, which `started` infers."""
+        return len(self._starts.free) > 0
+
+    @property
+    def _starts(self) -> Unknowns:
+        """The starts of the states, as unknowns, beside the parameters as estimated."""
+        present = dict(zip(self.equations.names, self.values.tolist(), strict=True))
+        return unknowns_of(self.equations, (), present)
 
     def predictive(self, record: Trajectories) -> Prediction:
         """The distribution of each sample of a record given all earlier ones.

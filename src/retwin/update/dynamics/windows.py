@@ -146,16 +146,18 @@ class Windows:
         """The states (w, d_x) at the first sample of each window, at parameters (k,)."""
         return self._at(tuple(theta.tolist()))[0]
 
-    def with_starts(self, theta: NDArray) -> NDArray:
-        """Parameters (k,) with those that are starts at the mean of what the trajectories have."""
-        base, made = self._estimation.twin, theta.copy()
-        names = [f"start_{each.name}" for each in base.states]
+    def own_starts(self, theta: NDArray) -> dict[int, NDArray]:
+        """Of each parameter that is a start which is estimated, its value in each trajectory.
+
+        `theta` (k,) are the others; parameters are given by their numbers.
+        """
+        names = [f"start_{each.name}" for each in self._estimation.twin.states]
+        made, begin = {}, self.starts(theta)[self.first == 0]
         for i, each in enumerate(self.twin.parameters):
             own = [(names.index(place), e) for place, e in each.places.items() if place in names]
-            if own and (self.first == 0).any():
-                begin = self.starts(theta)[self.first == 0].mean(axis=0)
-                value = np.mean([begin[state] / factor for state, factor in own])
-                made[i] = np.clip(value, each.low, each.high)
+            if own and len(begin) and all(self.unknown[state] for state, _ in own):
+                values = np.mean([begin[:, state] / factor for state, factor in own], axis=0)
+                made[i] = np.clip(values, each.low, each.high)
         return made
 
     def outputs(self, theta: NDArray) -> NDArray:
@@ -191,6 +193,7 @@ def windows_of(
     used: NDArray,
     *,
     warm: int = 0,
+    own: bool = False,
 ) -> Windows | None:
     """Windows of a number of samples, or whole records, in which unstated starts are estimated.
 
@@ -204,6 +207,8 @@ def windows_of(
         Samples at the begin of each window by which alone its starts are estimated, so that the
         others are predictions; 0 for all. With it, windows that are not whole are left out, and the
         first one begins where the trajectory was first measured.
+    own : bool, default False
+        Whether each whole record has its own start also where that is a parameter of the twin.
 
     Returns
     -------
@@ -215,7 +220,7 @@ def windows_of(
     parameters = {place for each in free for place in each.places}
     unknown = np.array([length is not None or s.start is None for s in base.states])
     if length is None:
-        unknown &= [f"start_{s.name}" not in parameters for s in base.states]
+        unknown &= [own or f"start_{s.name}" not in parameters for s in base.states]
         if not unknown.any():
             return None
     size = length or observed.steps
@@ -249,9 +254,11 @@ def spread_of(observed: Trajectories) -> NDArray:
     return np.asarray(np.sqrt(np.sum(error**2, axis=(0, 1)) / count))
 
 
-def simulated(twin: ParametricTwin, measured: Trajectories, used: NDArray, *, seed: int) -> NDArray:
+def simulated(
+    twin: ParametricTwin, measured: Trajectories, used: NDArray, *, seed: int, own: bool = False
+) -> NDArray:
     """Outputs (n, T, d_y) of free simulations, whose unstated starts fit the samples `used`."""
-    windows = windows_of(twin, measured, None, used) if state_based(twin) else None
+    windows = windows_of(twin, measured, None, used, own=own) if state_based(twin) else None
     outputs = None if windows is None else windows.outputs(np.array(twin.values))
     if outputs is None or np.isnan(outputs).any():
         outputs = twin.simulate(measured.commands.astype(np.float64), seed=seed).observed

@@ -6,7 +6,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import overload
 
@@ -91,6 +91,10 @@ class Updated:
         What was compared for it, the chosen one first; empty where there was no choice.
     lasting : bool
         Whether effects of a start or of early commands last until the end of the record.
+    own_starts : dict of str to float
+        Parameters that are starts of states of which each record has its own: by name, the standard
+        deviation between the records, of which the mean is in `values`. `errors`, `intervals` and
+        `identifiability` are those of the other parameters.
 
     """
 
@@ -110,6 +114,7 @@ class Updated:
     horizon: float = np.inf
     horizons: tuple[Candidate, ...] = ()
     lasting: bool = False
+    own_starts: dict[str, float] = field(default_factory=dict)
 
 
 @overload
@@ -220,7 +225,9 @@ def identify(
         with begin(twin, observed) as misfit:
             found = infer_posterior(misfit, method, progress)
     else:
-        found = _search(twin, observed, method, horizon, (begin, missing, progress))
+        several = isinstance(observed, Trajectories) and len(observed) > 1
+        how = (partial(begin, own=several), missing, progress)
+        found = _search(twin, observed, method, horizon, how)
         copies = int(found.figures["copies"])
         again = f"{copies} of {len(observed)} trajectories are copies and count once"
         for note in filter(None, [found.identifiability.warning, missing, again * bool(copies)]):
@@ -303,14 +310,19 @@ def _fit(
     best, point = optima[0] = _hold_insensitive(search, *optima[0])
     residual = misfit.residuals(np.array([best.values]))[0]
     once = distinct_records(np.where(misfit.seen, misfit.measured, np.nan))
-    found, errors, agreeing = _identifiability(search, optima, point, residual, once)
     values = np.array(best.values)
-    if misfit.windows is not None:
-        values = misfit.windows.with_starts(values)
+    starts = {} if misfit.windows is None else misfit.windows.own_starts(values)
+    for number, each in starts.items():
+        values[number] = each.mean()
+    if len(starts) == len(values):  # nothing else is to be identified
+        starts = {}
+    shared = np.array([number not in starts for number in range(len(values))])
+    found, errors, agreeing = _identifiability(search, optima, point, residual, once, shared)
     best = replace(best, values=tuple(values.tolist()))
     optima[0] = best, point
     count = len(once)
     half = stats.t.ppf(0.975, max(count - 1, 1)) * errors
+    names, known = np.array(twin.names)[shared].tolist(), values[shared]
     unknown = ""
     if np.isnan(errors).any():
         alone = "" if count < MIN_TRAJECTORIES else ", of which one alone determines a parameter"
@@ -318,10 +330,8 @@ def _fit(
     return Updated(
         twin=twin.with_values(best.values),
         values=dict(zip(twin.names, best.values, strict=True)),
-        errors=dict(zip(twin.names, errors.tolist(), strict=True)),
-        intervals=dict(
-            zip(twin.names, zip(values - half, values + half, strict=True), strict=True)
-        ),
+        errors=dict(zip(names, errors.tolist(), strict=True)),
+        intervals=dict(zip(names, zip(known - half, known + half, strict=True), strict=True)),
         objective=float(np.sqrt(np.sum(residual**2))),
         starts=tuple(each for each, _ in optima),
         identifiability=found,
@@ -338,6 +348,7 @@ def _fit(
         reason="; ".join(filter(None, [best.reason, found.warning, missing, unknown])),
         loss=search.loss,
         scale=search.scale,
+        own_starts={twin.names[number]: float(each.std()) for number, each in starts.items()},
     )
 
 
@@ -369,15 +380,18 @@ def _identifiability(
     best: NDArray,
     residual: NDArray,
     once: NDArray,
+    shared: NDArray,
 ) -> tuple[Identifiability, NDArray, int]:
     """The identifiability at the best optimum, its standard errors, and how many starts agree.
 
-    Trajectories that are not among `once` are copies, and no information.
+    It is that of the `shared` parameters (k,), which do not differ between trajectories. Those that
+    are not among `once` are copies, and no information.
     """
     misfit = search.misfit
     # Outliers have as little weight in the standard errors as they had in the optimum.
     _, gradient, curvature = search.linearised(residual)
-    jacobian, width = search.jacobian(best).reshape(*residual.shape, -1), misfit.high - misfit.low
+    jacobian = search.jacobian(best).reshape(*residual.shape, -1)[..., shared]
+    width, best = (misfit.high - misfit.low)[shared], best[shared]
     # As least squares: near the optimum, losses are squares of residuals that have these weights.
     weight = np.sqrt(curvature)[once]
     errors = width * standard_errors(jacobian[once] * weight[..., None], gradient[once] / weight)
@@ -388,9 +402,9 @@ def _identifiability(
     # As well as the best: within the 95 % range of the objective under noise (chi-square).
     measured, lowest = int(seen.sum()), optima[0][0].objective ** 2
     margin = CHI2_95 * noise_of(residual, measured, len(best)) + 1e-6 * lowest
-    alternatives = [point for each, point in optima if each.objective**2 <= lowest + margin]
+    alternatives = [p[shared] for each, p in optima if each.objective**2 <= lowest + margin]
     found = identifiability(
-        misfit.twin.names,
+        tuple(np.array(misfit.twin.names)[shared].tolist()),
         jacobian,
         residual,
         measured=measured,

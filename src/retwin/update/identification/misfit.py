@@ -171,11 +171,12 @@ def misfit_of(
     rate: float | None,
     processes: int,
     length: int | None = None,
+    own: bool = False,
 ) -> Iterator[Misfit]:
     """The misfit of a twin, with worker processes during the block if `processes` exceeds 1.
 
     The starts of windows of `length` samples, or those of whole records that are not given, are
-    estimated if the twin has states.
+    estimated if the twin has states; with `own`, unstated starts of each whole record too.
 
     Raises InputError if twin and data do not fit each other.
     """
@@ -184,7 +185,7 @@ def misfit_of(
     stride = _check_data(twin, observed, rate)
     windows = None
     if state_based(twin):
-        windows = windows_of(twin, observed, length, sampled(observed.mask, stride))
+        windows = windows_of(twin, observed, length, sampled(observed.mask, stride), own=own)
     if processes == 1 or windows is not None:
         yield Misfit(twin, observed, stride=stride, seed=seed, windows=windows)
         return

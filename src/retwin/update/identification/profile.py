@@ -96,16 +96,17 @@ def profile(
         No such parameter, or fewer than three points.
 
     """
-    names = updated.twin.names
-    one_of("name", name, names)
+    names, local = updated.twin.names, updated.identifiability
+    one_of("name", name, local.names)
     whole("points", points, at_least=3)
     which, observed = names.index(name), measured_only(observed)
-    local = updated.identifiability
-    error, limit = local.errors[which], stats.t.ppf(0.975, local.freedom[which]) ** 2
+    own, shared = bool(updated.own_starts), local.names.index(name)
+    error, limit = local.errors[shared], stats.t.ppf(0.975, local.freedom[shared]) ** 2
     if np.isfinite(updated.errors[name]):
         error = updated.errors[name]
         limit = stats.t.ppf(0.975, len(observed) - 1) ** 2
-    with misfit_of(updated.twin, observed, seed=0, rate=rate, processes=processes) as misfit:
+    begin = misfit_of(updated.twin, observed, seed=0, rate=rate, processes=processes, own=own)
+    with begin as misfit:
         search = Search(misfit, LeastSquares(starts=1), None)
         search.loss, search.scale = updated.loss, updated.scale
         best = (np.array(updated.twin.values) - misfit.low) / search.width
@@ -116,7 +117,7 @@ def profile(
         _, gradient, curvature = search.linearised(misfit.residuals(search.theta(best[None]))[0])
         residual = gradient / np.sqrt(search.average_curvature(curvature))
         noise = variance_of(residual, int(misfit.seen.sum()), len(names))
-        noise *= (error / local.white[which]) ** 2 if np.isfinite(error) else 1.0
+        noise *= (error / local.white[shared]) ** 2 if np.isfinite(error) else 1.0
     return Profile(
         name,
         misfit.low[which] + search.width[which] * grid,
