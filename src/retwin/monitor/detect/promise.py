@@ -167,8 +167,11 @@ class Tried:
             f"{duration(self.run_length / rate)} (exact 95 %)"
         )
         if count:
-            text += f"; {self.events[worst]} of them in {worst}: records of more days would help"
-        return f"{text}."
+            text += f"; {self.events[worst]} of them in {worst}"
+        return (
+            f"{text}. The promise extends to no states, loads and days that these parts do not "
+            "contain: calibrate with records that do."
+        )
 
 
 def shortest(events: int, samples: float) -> float:
