@@ -61,18 +61,21 @@ def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:
     within = replace(later, probability=0.8, onset=(3.1, 3.0, 4.0))
     for more, text in (((later,), "0.25"), ((beside,), "0.2 "), ((within,), "0.2 ")):
         (row,) = _event_rows(watched, [found, *more], 1.0)  # type: ignore[arg-type]
-        assert row[-1].startswith(f"leaking from 2 s; size {text.strip()} 1/s")
+        assert row[-1].startswith(f"leaking from 2.0 s; size {text.strip()} 1/s")
     anew = replace(first, event=9, sample=9, time=9.0)
     both = SimpleNamespace(events=[first, anew], endings=[])
     same, other = replace(found, alarm=anew), replace(beside, alarm=anew, same=False)
-    for cause, said in ((same, "again, or still: leaking from 2 s"), (other, "weak pump from 2 s")):
+    for cause, said in (
+        (same, "again, or still: leaking from 2.0 s"),
+        (other, "weak pump from 2.0 s"),
+    ):
         rows = _event_rows(both, [found, cause], 1.0)  # type: ignore[arg-type]
         assert rows[0][-1].startswith("leaking")
         assert rows[1][-1].startswith(said)
     remark = SimpleNamespace(events=[replace(first, promised=False)], endings=[])
     (row,) = _event_rows(remark, [found], 1.0)  # type: ignore[arg-type]
     assert row[-2].startswith("remark: ")
-    assert row[-1].startswith("if it is a fault: leaking from 2 s")
+    assert row[-1].startswith("if it is a fault: leaking from 2.0 s")
     second = replace(within, name="weak pump", size=(-0.5, -0.6, -0.4), unit="", same=False)
     (row,) = _event_rows(watched, [found, second], 1.0)  # type: ignore[arg-type]
     assert row[-1].endswith(

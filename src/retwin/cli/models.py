@@ -111,6 +111,7 @@ def _write_bands(
 
     updated, system = source_of(model, case)
     records = read_commands(commands, system, mapping=mapping)
+    _note_start(updated, begin)
     found = predict_records(updated, records, started=begin, seed=seed)
     write_predictions(found, records, out)
     picture = png(draw_prediction(records, found.mean, found.deviation), emulated=records.emulated)
@@ -160,6 +161,7 @@ def evaluate(
     updated = updated_twin(model)
     system = system_of(updated, model, case)
     records = read(real, system, part="test", max_bytes=max_bytes, mapping=mapping)
+    _note_start(updated, begin)
     scores = score_model(
         updated,
         records,
@@ -198,6 +200,14 @@ def evaluate(
     )
     if out is not None:
         note(f"Wrote predictions to {out}")
+
+
+def _note_start(model: Twin, begin: float) -> None:
+    """Note that a warm-up gives no start of a model that starts alike in each record."""
+    from retwin.update.forecasts import unknown_starts
+
+    if begin and not unknown_starts(model):
+        note("Not inferred by --warm-up: this model starts alike in each record.")
 
 
 def _start_remarks(

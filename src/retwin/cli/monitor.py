@@ -430,10 +430,16 @@ def _event_rows(
 ) -> list[tuple[str, str, str, str, str]]:
     """Each event with its begin and end, and its causes as they became known."""
     from retwin.monitor.models.cause import cause_text
+    from retwin.report.labels import significant
 
     def text(cause: Cause) -> str:
-        onset = cause.onset[0]
-        return cause_text(vars(cause), "" if isnan(onset) else f"{onset:.6g} s")
+        onset, low, high = cause.onset
+        if isnan(onset):
+            return cause_text(vars(cause), "")
+        known = f"{significant(onset, high - low)} s"
+        if high - low > 2 / rate:
+            known += f" ({significant(low, high - low)} to {significant(high, high - low)})"
+        return cause_text(vars(cause), known)
 
     ends = {(each.trajectory, each.event): each for each in watched.endings}
     rows, before = [], dict[str, str]()
