@@ -65,13 +65,12 @@ def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:
     anew = replace(first, event=9, sample=9, time=9.0)
     both = SimpleNamespace(events=[first, anew], endings=[])
     same, other = replace(found, alarm=anew), replace(beside, alarm=anew, same=False)
-    for cause, said in (
-        (same, "again, or still: leaking from 2.0 s"),
-        (other, "weak pump from 2.0 s"),
-    ):
-        rows = _event_rows(both, [found, cause], 1.0)  # type: ignore[arg-type]
-        assert rows[0][-1].startswith("leaking")
-        assert rows[1][-1].startswith(said)
+    (row,) = _event_rows(both, [found, same], 1.0)  # type: ignore[arg-type]
+    assert row[1:3] == ("3", "lasts")
+    assert row[-1].startswith("leaking from 2.0 s; size")
+    assert "again, or still, 1 time until 9 s, then leaking from 2.0 s" in row[-1]
+    rows = _event_rows(both, [found, other], 1.0)  # type: ignore[arg-type]
+    assert [each[-1][:9] for each in rows] == ["leaking f", "weak pump"]
     remark = SimpleNamespace(events=[replace(first, promised=False)], endings=[])
     (row,) = _event_rows(remark, [found], 1.0)  # type: ignore[arg-type]
     assert row[-2].startswith("remark: ")

@@ -260,7 +260,8 @@ def _print(
     for p in found.parameters:
         after = significant(p.value, p.error)
         unit = "" if p.unit == "1" else p.unit
-        parameters.append((p.name, unit, f"{p.start:.4g}", after, interval(p), state(p)))
+        before = "–" if p.own else f"{p.start:.4g}"
+        parameters.append((p.name, unit, before, after, interval(p), state(p)))
     held = found.compared == "validation"
     errors = []
     for each in found.outputs:

@@ -111,7 +111,7 @@ def _write_bands(
 
     updated, system = source_of(model, case)
     records = read_commands(commands, system, mapping=mapping)
-    _note_start(updated, begin)
+    _note_start(updated, records, begin)
     found = predict_records(updated, records, started=begin, seed=seed)
     write_predictions(found, records, out)
     picture = png(draw_prediction(records, found.mean, found.deviation), emulated=records.emulated)
@@ -161,7 +161,8 @@ def evaluate(
     updated = updated_twin(model)
     system = system_of(updated, model, case)
     records = read(real, system, part="test", max_bytes=max_bytes, mapping=mapping)
-    _note_start(updated, begin)
+    if begin:
+        _note_start(updated, records, begin)
     scores = score_model(
         updated,
         records,
@@ -195,23 +196,32 @@ def evaluate(
         f"{count}, {how}:",
         table(heads, rows, numbers=heads[2:6]),
         *_verdict(scores),
-        *([] if ahead or begin else _start_remarks(updated, records, units, seed)),
+        *([] if ahead or begin else _start_remarks(updated, records, scores, units, seed)),
         as_json=as_json,
     )
     if out is not None:
         note(f"Wrote predictions to {out}")
 
 
-def _note_start(model: Twin, begin: float) -> None:
-    """Note that a warm-up gives no start of a model that starts alike in each record."""
+def _note_start(model: Twin, records: Trajectories, begin: float) -> None:
+    """Note where the simulations of a model begin that is not asked to infer that, or cannot."""
     from retwin.update.forecasts import unknown_starts
 
     if begin and not unknown_starts(model):
         note("Not inferred by --warm-up: this model starts alike in each record.")
+    elif not begin and unknown_starts(model) and records.mask.any():
+        note(
+            "The model starts at the mean of its calibration records; --warm-up 5s infers the "
+            "start of each record from the first 5 s that were measured"
+        )
 
 
 def _start_remarks(
-    model: Twin, records: Trajectories, units: dict[str, str], seed: int
+    model: Twin,
+    records: Trajectories,
+    usual: list[ModelScore],
+    units: dict[str, str],
+    seed: int,
 ) -> list[str]:
     """Outputs that are predicted much better from starts that the records themselves give."""
     from retwin.evaluation import score_model
@@ -220,15 +230,18 @@ def _start_remarks(
     if not unknown_starts(model):
         return []
     begin = float(f"{records.lengths.max() / records.rate / BEGIN:.1g}")
-    usual, better = (
-        score_model(model, records, warm_up=begin, started=each, seed=seed) for each in (0.0, begin)
-    )
+    better = score_model(model, records, warm_up=begin, started=begin, seed=seed)
+    found = [
+        f"{b.rmse:.4g} in place of {a.rmse:.4g} {units[a.output]} ({a.output})"
+        for a, b in zip((each for each in usual if each.who == "model"), better, strict=False)
+        if b.rmse < MUCH * a.rmse
+    ]
+    if not found:
+        return []
     return [
-        f"{a.output}: from the start that the first {begin:g} s of each record give, the RMSE "
-        f"after them is {b.rmse:.4g} in place of {a.rmse:.4g} {units[a.output]}: --warm-up "
-        f"{begin:g}s."
-        for a, b in zip(usual, better, strict=True)
-        if a.who == "model" and b.rmse < MUCH * a.rmse
+        "Records begin in other states than the model, which starts at the mean of its calibration "
+        f"records: with starts that their first {begin:g} s give, the RMSE after that time is "
+        f"{', '.join(found)}. --warm-up {begin:g}s does so."
     ]
 
 

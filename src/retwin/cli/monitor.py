@@ -428,7 +428,11 @@ def _causes(
 def _event_rows(
     watched: Watched, causes: Sequence[Cause], rate: float
 ) -> list[tuple[str, str, str, str, str]]:
-    """Each event with its begin and end, and its causes as they became known."""
+    """Events with begin and end, and causes as they became known.
+
+    Events of a record that follow one with the same cause are in the row of that: a fault that
+    lasts may not show for a while.
+    """
     from retwin.monitor.models.cause import cause_text
     from retwin.report.labels import significant
 
@@ -442,7 +446,8 @@ def _event_rows(
         return cause_text(vars(cause), known)
 
     ends = {(each.trajectory, each.event): each for each in watched.endings}
-    rows, before = [], dict[str, str]()
+    rows = list[tuple[str, str, str, str, str]]()
+    before, further, shown = ("", ""), 0, ""
     for first in watched.events:
         named: list[Cause] = []
         for cause in causes:
@@ -456,12 +461,16 @@ def _event_rows(
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
         begin, texts = f"{first.time:.6g}", "; with more samples: ".join(map(text, named))
-        if named:  # a fault that lasts may not show for a while
-            texts = "again, or still: " * (named[0].name == before.get(first.trajectory)) + texts
-            before[first.trajectory] = named[-1].name
-        if named and not first.promised:
-            texts = f"if it is a fault: {texts}"
-        rows.append((first.trajectory, begin, until, what, texts))
+        if named and before in [(first.trajectory, each.name) for each in named]:
+            further += 1
+            times = f"{further} time{'s' * (further > 1)}"
+            texts = f"{shown}; again, or still, {times} until {begin} s, then {text(named[-1])}"
+            rows[-1] = (*rows[-1][:2], until, rows[-1][3], texts)
+        else:
+            further = 0
+            shown = f"if it is a fault: {texts}" if named and not first.promised else texts
+            rows.append((first.trajectory, begin, until, what, shown))
+        before = (first.trajectory, named[-1].name) if named else ("", "")
     return rows
 
 

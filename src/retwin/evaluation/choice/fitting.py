@@ -22,7 +22,12 @@ from retwin.evaluation.choice.candidates import Candidates, Model
 from retwin.evaluation.choice.comparison import Comparison
 from retwin.evaluation.choice.fitted import CandidateScore, Fitted
 from retwin.evaluation.choice.folds import Fold, block_length, block_means, folds_of
-from retwin.evaluation.choice.remarks import remarks_of, without_twin
+from retwin.evaluation.choice.remarks import (
+    correction_remarks,
+    remarks_of,
+    start_remarks,
+    without_twin,
+)
 from retwin.evaluation.choice.settings import MEMBERS, Choice
 from retwin.evaluation.choice.trials import Trials, shorter, unstable
 from retwin.progress import Progress
@@ -160,7 +165,12 @@ def fit(
         chosen=chosen,
         preferred=preferred,
         scores=scores,
-        remarks=(*remarks, *_at_bounds(whole, parameters), *_of_prior(model, others)),
+        remarks=(
+            *remarks,
+            *(start_remarks(records, model.forecast) or correction_remarks(scores, chosen)),
+            *_at_bounds(whole, parameters),
+            *_of_prior(model, others),
+        ),
         parameters=parameters,
         horizon=horizon,
         parts=tuple(each.name for each in folds),

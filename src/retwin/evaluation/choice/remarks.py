@@ -12,10 +12,14 @@ from retwin.evaluation.choice.comparison import Comparison
 from retwin.evaluation.choice.fitted import CandidateScore
 from retwin.evaluation.choice.folds import RECORDS
 from retwin.scores.residuals import autocorrelation, ljung_box
+from retwin.update.forecast_errors import USUAL, ForecastErrors
 from retwin.update.forecasts import errors_drift
 
 LONGEST = 0.1
 """Longest dead time that is tried, over the length of a record."""
+STARTED, HARDLY = 0.8, 0.98
+"""Ratios of errors from which starts of records are named, and a correction is said to be one of
+bands alone."""
 WHITE, COLOURED = 0.01, 0.5
 """p-value below which errors are no white noise, and autocorrelation from which most of their mean
 square is none."""
@@ -81,6 +85,39 @@ def _describe_uncorrected(
     text = f"The errors there {' and '.join(reasons)}: the twin lacks something that these "
     text += "corrections cannot express, unless it is a disturbance from outside or sensor noise."
     return [made, text]
+
+
+def start_remarks(records: Trajectories, errors: ForecastErrors | None) -> list[str]:
+    """That errors are mostly those of starts that differ between records."""
+    if errors is None or errors.started is None:
+        return []
+    pairs = zip(records.outputs.names, errors.started, errors.deviation[-1], strict=True)
+    found = [
+        f"{name} ± {USUAL * own:.3g} in place of {USUAL * usual:.3g}"
+        for name, own, usual in pairs
+        if own < STARTED * usual
+    ]
+    if not found:
+        return []
+    return [
+        "Records begin in different states, and these simulations at the mean of them. With starts "
+        f"that the first tenth of a record gives, 90 % bands are: {', '.join(found)} (evaluate, "
+        "generate --bands: --warm-up TIME)."
+    ]
+
+
+def correction_remarks(scores: Sequence[CandidateScore], chosen: str) -> list[str]:
+    """That a correction changes the distribution of errors, and hardly their size."""
+    rmse = {each.name: each.rmse for each in scores if each.rmse}
+    before = rmse.get("parameters", rmse.get("none"))
+    if before is None or chosen in ("none", "parameters"):
+        return []
+    if any(rmse[chosen][name] < HARDLY * error for name, error in before.items()):
+        return []
+    return [
+        f"The correction lowers the RMS error of no output by more than {1 - HARDLY:.0%}: it gives "
+        "better bands, and what the twin lacks is not among its terms. Write that into the twin."
+    ]
 
 
 def _worse_than_mean(records: Trajectories, score: CandidateScore) -> list[str]:

@@ -89,7 +89,7 @@ def _parameters(found: Identification) -> Table:
     rows = [
         [
             Cell(each.name, shown_unit(each.unit)),
-            significant(each.start),
+            "–" if each.own else significant(each.start),
             Cell(value(each), best=True),
             interval(each),
             f"{significant(each.low)} to {significant(each.high)}",
