@@ -116,7 +116,7 @@ def correction_remarks(scores: Sequence[CandidateScore], chosen: str) -> list[st
         return []
     return [
         f"The correction lowers the RMS error of no output by more than {1 - HARDLY:.0%}: it gives "
-        "better bands, and what the twin lacks is not among its terms. Write that into the twin."
+        "better bands, and does not express what the twin lacks. Write that into the twin."
     ]
 
 
