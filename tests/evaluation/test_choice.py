@@ -16,7 +16,7 @@ from retwin.evaluation import ModelScore, predict_records
 from retwin.evaluation.choice.comparison import Comparison, Predicted
 from retwin.evaluation.choice.fitting import _row, with_yardstick
 from retwin.evaluation.choice.folds import Fold, block_means, folds_of
-from retwin.evaluation.choice.remarks import remarks_of
+from retwin.evaluation.choice.remarks import correction_remarks, remarks_of
 from retwin.report.choice import fit_page
 from retwin.twins import State, StateTwin
 from retwin.update import Dynamics, StationaryNoise, free_moments
@@ -168,6 +168,10 @@ def test_bands_hold_where_records_begin_in_other_states(tmp_path: Path) -> None:
     held = predict_records(found.twin, fresh)
     later = np.abs(fresh.observed - held.mean)[:, 60:] <= 1.645 * held.deviation[:, 60:]
     assert later.mean() > 0.85
+    assert any("Records begin in different states" in each for each in found.remarks)
+    assert not correction_remarks(found.scores, "dynamics")
+    alike = [replace(each, rmse=found.score("parameters").rmse) for each in found.scores]
+    assert "does not express what the twin lacks" in correction_remarks(alike, "dynamics")[0]
     # From starts that their first samples give, they are predicted from the start on.
     found.twin.save(tmp_path / "model")
     for model in (found.twin, rt.load_twin(tmp_path / "model")):

@@ -110,7 +110,7 @@ def correction_remarks(scores: Sequence[CandidateScore], chosen: str) -> list[st
     """That a correction changes the distribution of errors, and hardly their size."""
     rmse = {each.name: each.rmse for each in scores if each.rmse}
     before = rmse.get("parameters", rmse.get("none"))
-    if before is None or chosen in ("none", "parameters"):
+    if before is None or chosen not in rmse or chosen in ("none", "parameters"):
         return []
     if any(rmse[chosen][name] < HARDLY * error for name, error in before.items()):
         return []
