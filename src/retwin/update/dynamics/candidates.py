@@ -13,6 +13,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.equations.interpolation import delays_tried
 from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.dynamics.discrepancy.equations import CorrectedEquations
 from retwin.update.dynamics.discrepancy.memory import Memory, times_tried, with_memories
 from retwin.update.dynamics.estimation import Estimation, correlation_time
@@ -195,12 +196,19 @@ def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin
 def _forms(
     alone: Estimation, point: Point, settings: Dynamics, visited: NDArray
 ) -> Iterator[CorrectedEquations]:
-    """The corrected equations with each form that is tried, at the parameters of a point."""
+    """The corrected equations with each form that is tried, at the parameters of a point.
+
+    A form that differs from the one before in no term of these equations is left out.
+    """
     unknowns = alone.unknowns
     twin = _with_starts(alone.twin, unknowns, point)
     both = (visited, alone.acting(point))
+    terms: list[Parameter] | None = None
     for form in settings.forms:
-        yield CorrectedEquations.distinct(twin, form, settings, both, unknowns.matrix)
+        made = CorrectedEquations.distinct(twin, form, settings, both, unknowns.matrix)
+        if made.coefficients != terms:
+            yield made
+        terms = made.coefficients
 
 
 def _with_discrepancy(

@@ -54,7 +54,8 @@ class Equation:
     index : int
         The index of its state.
     places : sequence of int
-        Indices of the variables of its discrepancy among the states and then the commands.
+        Indices of the variables of its discrepancy among the states, the commands, and the time
+        derivatives that the twin gives.
     terms : sequence of Term
         The terms of its discrepancy.
     zero : float, optional
@@ -188,11 +189,12 @@ class CorrectedEquations:
             signs = settings.signs(state, own)
             zeros = [float(rest[place]) for place in places]
             count = sum(place < len(names) for place in places)
-            terms = [
-                term
-                for term in self.form.terms(own, count, signs, zeros)
-                if f"{state}: {term.name}" not in self.dropped
-            ]
+            terms = list(self.form.terms(own, count, signs, zeros))
+            known = given or any(signs) or state in settings.passive or twin.learned
+            if not (known or _is_rate(twin, i)) and isinstance(self.form, Library):
+                terms += self.form.dead_zone(f"{state}'", len(own))
+                places.append(len(everything) + i)
+            terms = [each for each in terms if f"{state}: {each.name}" not in self.dropped]
             zero = float(rest[i]) if state in settings.passive else None
             common = SHARED if any(signs) else ABSORBED
             made.append(Equation(i, places, terms, zero, common))
@@ -229,7 +231,8 @@ class CorrectedEquations:
         def corrected(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
             returned = function(x, u, named(*p[:own]))
             slope = [returned] if getattr(returned, "ndim", 1) == 0 else list(returned)
-            found = self.discrepancies(self.domain.scaled([*x, *u]), p[own:])
+            variables = [*self.domain.scaled([*x, *u]), *self._rates(x, slope)]
+            found = self.discrepancies(variables, p[own:])
             for equation, each in zip(self.equations, found, strict=True):
                 i = equation.index
                 slope[i] = slope[i] + float(self.domain.speed[i]) * each
@@ -245,7 +248,7 @@ class CorrectedEquations:
         )
 
     def discrepancies(self, variables: Sequence[Any], coefficients: Sequence[Any]) -> list[Any]:
-        """Per equation, the discrepancy over the speed of its state, at scaled variables."""
+        """Per equation, the discrepancy over the speed of its state, at its variables."""
         made = []
         for equation, weights, inner in self._split(coefficients):
             values = equation.values(variables, inner)
@@ -317,10 +320,19 @@ class CorrectedEquations:
         return basis[:, size > DISTINCT].T.reshape(-1, count, len(self.visited[0]))
 
     def _scaled(self, states: NDArray, commands: NDArray) -> list[Any]:
+        """The scaled variables of all equations, see `Equation.places`."""
         import torch
 
-        both = torch.as_tensor(np.concatenate([states, commands], axis=1))
-        return self.domain.scaled(both.unbind(1))
+        x, u = (list(torch.as_tensor(each).unbind(1)) for each in (states, commands))
+        values = self.twin.values(None, 1)[0, : len(self.twin.parameters)]
+        p = [torch.full_like(x[0], each) for each in values.tolist()]
+        slope = self.twin.model.evaluate("slope", x, u, p)
+        return [*self.domain.scaled([*x, *u]), *self._rates(x, slope)]
+
+    def _rates(self, x: Sequence[Any], slope: Sequence[Any]) -> list[Any]:
+        """Time derivatives that the twin gives, over the speeds of the states."""
+        steps = [b - a for a, b in zip(x, slope, strict=True)] if self.twin.step else slope
+        return [each / float(own) for each, own in zip(steps, self.domain.speed, strict=True)]
 
 
 def _some(states: NDArray, commands: NDArray) -> tuple[NDArray, NDArray]:
@@ -409,6 +421,12 @@ def correctable(twin: StateTwin, wanted: Sequence[str]) -> tuple[str, ...]:
 def _is_definition(twin: StateTwin, equation: int) -> bool:
     known = {node.index for letter in "up" for node in twin.model.variables[letter]}
     return all(node.op in LINEAR and node.index not in known for node in _nodes(twin, equation))
+
+
+def _is_rate(twin: StateTwin, equation: int) -> bool:
+    """Whether a state is the time derivative of another one, as a velocity is."""
+    others = (i for i in range(len(twin.states)) if i != equation and _is_definition(twin, i))
+    return any(equation in variables_of(twin, i) for i in others)
 
 
 def _nodes(twin: StateTwin, equation: int) -> list[Node]:

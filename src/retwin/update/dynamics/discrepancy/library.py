@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations_with_replacement, product
 from math import comb, prod
@@ -51,17 +51,21 @@ class Library:
         Whether Coulomb and quadratic friction, sign(v) and v |v|, of each state are included. They
         change sign where the state is 0, in its own unit. The sign function is smooth; its width,
         which is that of a motion near 0 or of lubrication, is estimated.
+    sticking : bool, default True
+        Whether friction may also hold a state, see `dead_zone`; not without `friction`.
 
     """
 
     degree: int = 3
     knots: Sequence[float] = (0.0, 0.4, 0.8)
     friction: bool = True
+    sticking: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", floats(self.knots))
         whole("degree", self.degree, at_least=0)
         one_of("friction", self.friction, (True, False))
+        one_of("sticking", self.sticking, (True, False))
         require(
             all(0 <= knot <= 1 for knot in self.knots),
             "knots",
@@ -77,8 +81,9 @@ class Library:
 
     def nested(self) -> list[Library]:
         """Libraries of which each contains the one before; the last is this one."""
-        smooth = [Library(degree, (), False) for degree in range(self.degree + 1)]
-        return [*(each for each in smooth if each != self), self]
+        smaller = [Library(degree, (), False) for degree in range(self.degree + 1)]
+        smaller.append(replace(self, sticking=False))
+        return [*(each for each in smaller if each != self), self]
 
     def terms(
         self,
@@ -122,6 +127,17 @@ class Library:
                 found.append(Term(f"{name} |{name}|", quadratic, only))
         return list(allowed(found, signs or [0] * len(variables)))
 
+    def dead_zone(self, rate: str, count: int) -> list[Term]:
+        """Dry friction of a state with such a time derivative, the variable after `count` others.
+
+        It is the twin's own derivative, which friction takes away where it is small: a valve moves
+        where the force on it exceeds its friction. A weight of 1 leaves nothing of it. Where the
+        velocity is a state itself, friction is a sign of that.
+        """
+        width = Parameter(f"log width of the dead zone of {rate}", "1", *WIDTHS, 0.0)
+        term = Term(f"dead zone of {rate}", _dead_zone, [None] * count, (width,), 0.0, 1.0)
+        return [term] if self.friction and self.sticking else []
+
 
 def _monomial(v: Sequence[Any], chosen: Sequence[int]) -> Any:
     return prod(v[i] for i in chosen)
@@ -141,6 +157,11 @@ def _hinge(v: Sequence[Any], shift: Any = 0.0, *, i: int, sign: int, knot: float
 
 def _sign(v: Sequence[Any], width: Any, i: int, zero: float) -> Any:
     return torch.tanh((v[i] - zero) / (WIDTH * torch.exp(torch.as_tensor(width).double())))
+
+
+def _dead_zone(v: Sequence[Any], width: Any) -> Any:
+    size = WIDTH * torch.exp(torch.as_tensor(width).double())
+    return size + torch.relu(v[-1] - size) - torch.relu(v[-1] + size)
 
 
 def _quadratic(v: Sequence[Any], i: int, zero: float) -> Any:
