@@ -503,7 +503,7 @@ def test_a_sample_that_predicts_better_is_named_as_what_it_is(
         ModelScore(who, "y", horizon, rmse, rmse, float("nan"), float("nan"))
         for who, rmse in (("model", 2.0), ("hold", 1.0))
     ]
-    assert _verdict(scores) == [f"y: the {sample} sample is a better prediction."]
+    assert _verdict(scores) == [f"y: the {sample} sample is a better prediction, by RMSE."]
 
 
 @pytest.mark.parametrize(

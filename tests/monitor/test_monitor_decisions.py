@@ -698,6 +698,16 @@ def test_a_fault_is_seen_at_the_stated_share(
     (found,) = visibility.visible_sizes(monitor, recorded(1), {"leak": LEAK})
     assert (found.size is not None) is seen
     assert ("not seen" in str(Visible("leak", None, None, share, 1.0))) is not seen
+    assert found.hidden is not seen
+
+
+@pytest.mark.parametrize(("size", "hidden"), [(0.049, False), (0.05, True), (None, False)])
+def test_a_fault_as_large_as_what_it_changes_is_no_better_than_hidden(
+    size: float | None, hidden: bool
+) -> None:
+    found = Visible("leak", size, 0.1, 1.0, 5.0, "1/s", 0.05)
+    assert found.hidden is hidden
+    assert ("98% of the value" in str(found)) is (size == 0.049)
 
 
 # The page.

@@ -263,7 +263,7 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
         if each.who != "model":
             own = next(s for s in scores if s.who == "model" and s.output == each.output)
             if each.rmse < (1 - CLEAR) * own.rmse:
-                made.append(f"{each.output}: {words[each.who]} is a better prediction.")
+                made.append(f"{each.output}: {words[each.who]} is a better prediction, by RMSE.")
         elif each.coverage < COVERAGE[0]:
             text = f"{each.output}: the 90 % band holds {each.coverage:.0%} of these samples"
             if each.interval is None or each.interval[1] >= LEVEL:

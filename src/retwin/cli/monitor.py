@@ -56,6 +56,8 @@ EQUATIONS = (
     "watched, and causes are its parameters too."
 )
 """What would watch the twin itself, where a black box takes its place."""
+FEW = 6
+"""Faults that are listed, at most."""
 EVENT = ("file", "record", "from s", "to s", "what", "cause")
 """What is shown of an event."""
 CONFIG = Path("monitor.toml")
@@ -520,6 +522,13 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
         f"This replay of {shown}; if the machine was healthy all the time, that alone bounds their "
         f"rate at one in {bound} (exact 95 %). {_describe_promise(monitor)}"
     )
+    hidden = [each.fault for each in monitor.visible if each.hidden]
+    if hidden and not events:
+        text += (
+            " Not seen, or only where they are as large as what they change: "
+            f"{', '.join(hidden[:FEW])}{' and others' * (len(hidden) > FEW)}. Smaller faults of "
+            "other kinds than `monitor fit` listed are not seen either."
+        )
     if events and poisson.sf(events - 1, samples / monitor.run_length) < monitor.alpha:
         text += (
             " More events were seen than it allows: these are faults, or, if the machine was "

@@ -23,6 +23,8 @@ from retwin.progress import Progress
 from retwin.twins.collected import SimulationError
 from retwin.twins.faults.actuator_faults import Fault, Stuck
 from retwin.twins.faults.system_faults import (
+    ActuatorGain,
+    ParameterFault,
     SensorError,
     SensorFreeze,
     SizedFault,
@@ -30,6 +32,7 @@ from retwin.twins.faults.system_faults import (
     measured_with,
 )
 from retwin.twins.twin import check_channels
+from retwin.update.dynamics.twin import DynamicsTwin
 
 ONSETS = 20
 """Onsets that are tried of each fault and size, at most."""
@@ -89,8 +92,17 @@ def visible_sizes(
                     unseen = unseen[:middle]
         if np.isfinite(share):  # of a fault that the twin can simulate
             unit = size_unit(fault, monitor.twin)
-            made.append(Visible(name, best, largest, share, within, unit))
+            value = _compared(fault, monitor.twin)
+            made.append(Visible(name, best, largest, share, within, unit, value))
     return made
+
+
+def _compared(fault: Fault | None, twin: DynamicsTwin) -> float | None:
+    """What a fault's size is compared with, see `Visible`."""
+    if isinstance(fault, ParameterFault) and not fault.grows:
+        values = dict(zip(twin.equations.names, twin.values.tolist(), strict=True))
+        return values.get(fault.parameter)
+    return 1.0 if isinstance(fault, ActuatorGain) else None
 
 
 @dataclass(frozen=True)

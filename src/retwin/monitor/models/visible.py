@@ -27,6 +27,9 @@ class Visible:
         That time in s.
     unit : str
         Of the sizes; "" where there are none.
+    value : float or None
+        What is changed by a size as large as itself: a parameter, or 1 for a command; None where a
+        size is compared with nothing.
 
     """
 
@@ -36,6 +39,14 @@ class Visible:
     share: float
     within: float
     unit: str = ""
+    value: float | None = None
+
+    @property
+    def hidden(self) -> bool:
+        """Whether it is not seen, or only where it is as large as what it changes."""
+        if self.value is None or self.size is None:
+            return self.share < SHARE
+        return self.share < SHARE or abs(self.size) >= abs(self.value)
 
     def __str__(self) -> str:
         """One line for the terminal."""
@@ -47,7 +58,9 @@ class Visible:
                 else f"not seen up to {abs(self.largest):.3g}{of}"
             )
         else:
-            what = (
-                "seen" if self.size is None else f"seen from a size of {abs(self.size):.3g}{of} on"
-            )
+            what = "seen"
+            if self.size is not None:
+                what = f"seen from a size of {abs(self.size):.3g}{of} on"
+                if self.value and self.value != 1:
+                    what += f", {abs(self.size / self.value):.0%} of the value"
         return f"{self.fault}: {what} ({self.share:.0%} within {self.within:.3g} s)"
