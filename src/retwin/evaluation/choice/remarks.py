@@ -84,9 +84,6 @@ def _describe_uncorrected(
         return [made]
     text = f"The errors there {' and '.join(reasons)}: the twin lacks something that these "
     text += "corrections cannot express, unless it is a disturbance from outside or sensor noise."
-    if "dynamics" in comparison.predicted:
-        text += " State equations are corrected in the variables that they have: `depends` in "
-        text += "[dynamics] of the case allows others."
     return [made, text]
 
 
@@ -120,7 +117,7 @@ def correction_remarks(scores: Sequence[CandidateScore], chosen: str) -> list[st
     return [
         f"The correction lowers the RMS error of no output by more than {1 - HARDLY:.0%}: it gives "
         "better bands, and does not express what the twin lacks, unless that is a disturbance from "
-        "outside. Write it into the twin, or allow other variables (`depends` in [dynamics])."
+        "outside. Write it into the twin."
     ]
 
 

@@ -15,6 +15,7 @@ from retwin.twins.equations.interpolation import delays_tried
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.dynamics.discrepancy.equations import CorrectedEquations
+from retwin.update.dynamics.discrepancy.library import Library
 from retwin.update.dynamics.discrepancy.memory import Memory, times_tried, with_memories
 from retwin.update.dynamics.estimation import Estimation, correlation_time
 from retwin.update.dynamics.left_out import errors_without, held_out
@@ -38,6 +39,9 @@ lower the logarithms of held-out errors."""
 HELD = 1e-3
 """Standard deviation of what the outputs of the twin alone do not determine, in those of the
 parameters if each were the only one: a discrepancy would determine it by its prior alone."""
+OPEN, MAX_OPEN = 2, 100
+"""Degree of the monomials of all states and commands in each equation, and number of coefficients
+above which they are not tried."""
 MAX_STRENGTHS = 30
 """Number of variances at most."""
 ERROR_STEPS = 2
@@ -57,6 +61,11 @@ class Candidate:
     found: Linearised
     held_out: HeldOut
     squares: tuple[NDArray, NDArray]
+
+    @property
+    def opened(self) -> bool:
+        """Whether its equations have terms of all variables, which nobody asked for."""
+        return self.equations.opened
 
     @classmethod
     def tested(
@@ -168,16 +177,17 @@ def searched(
 def best_of(tried: Sequence[Candidate]) -> Candidate:
     """The simplest candidate whose held-out errors are those of the best one, up to chance."""
     best = tried[_simplest([each.squares for each in tried])]
-    without = [each for each in tried if each.memory is None]
+    more = best.memory is not None or best.opened
+    without = [each for each in tried if each.memory is None and not each.opened]
     other = without[_simplest([each.squares for each in without])]
-    return other if best.memory and not better(best, other) else best
+    return other if more and not better(best, other) else best
 
 
 def better(candidate: Candidate, other: Candidate) -> bool:
     """Whether a candidate has lower held-out errors in nearly all parts.
 
     It is asked for what can imitate other errors: a memory is a state more, and with a short time
-    constant much like a parameter.
+    constant much like a parameter; and an equation may depend on all variables by chance.
     """
     before, after = (np.log(np.concatenate(each.squares)) for each in (other, candidate))
     change = (after - before)[np.isfinite(after - before)]
@@ -198,7 +208,8 @@ def _forms(
 ) -> Iterator[CorrectedEquations]:
     """The corrected equations with each form that is tried, at the parameters of a point.
 
-    A form that differs from the one before in no term of these equations is left out.
+    A form that differs from the one before in no term of these equations is left out. The last one
+    has terms of all states and commands in each equation, unless it is known on what they depend.
     """
     unknowns = alone.unknowns
     twin = _with_starts(alone.twin, unknowns, point)
@@ -209,6 +220,15 @@ def _forms(
         if made.coefficients != terms:
             yield made
         terms = made.coefficients
+    if settings.library is None or settings.known or twin.learned:
+        return
+    form = Library(min(settings.library.degree, OPEN), (), False)
+    same, made = (
+        CorrectedEquations.distinct(twin, form, settings, both, unknowns.matrix, opened=each)
+        for each in (False, True)
+    )
+    if len(same.coefficients) < len(made.coefficients) <= MAX_OPEN:
+        yield made
 
 
 def _with_discrepancy(

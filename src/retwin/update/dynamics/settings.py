@@ -36,7 +36,9 @@ class Dynamics:
         the structure.
     depends : mapping of str to sequence of str
         Per corrected state, the states and commands on which its discrepancy may depend ("command
-        NAME" for a command with the name of a state); by default those of the equation itself.
+        NAME" for a command with the name of a state); by default those of the equation itself, and
+        monomials of all, up to the second degree, where they predict nearly all held-out parts
+        better and nothing else is known.
     monotone : mapping of str to mapping of str to int
         Per corrected state, the variables in which its discrepancy is monotone: 1 where it is
         non-decreasing, -1 where it is non-increasing, whatever the other variables are.
@@ -113,8 +115,12 @@ class Dynamics:
 
     def remembers(self, form: Library | TanhNetwork) -> bool:
         """Whether a memory is tried beside a form."""
-        known = self.depends or self.monotone or self.passive
-        return self.memory and not known and isinstance(form, Library) and form.linear
+        return self.memory and not self.known and isinstance(form, Library) and form.linear
+
+    @property
+    def known(self) -> bool:
+        """Whether something is known of the structure of the discrepancy."""
+        return bool(self.depends or self.monotone or self.passive)
 
     def signs(self, state: str, variables: Sequence[str]) -> list[int]:
         """Per variable of a state equation, the sign of the slope of its discrepancy, or 0."""

@@ -3,8 +3,9 @@
     x' = f(x, u; theta) + delta(x, u; psi)
 
 The discrepancy of an equation depends on the variables of that equation alone, so that the
-structure of the twin, which is known, is kept. An equation without parameters, commands and
-nonlinear operations, such as position' = velocity, is a definition, in which there is none.
+structure of the twin, which is known, is kept, unless the equations are opened. An equation without
+parameters, commands and nonlinear operations, such as position' = velocity, is a definition, in
+which there is none.
 """
 
 from __future__ import annotations
@@ -107,6 +108,8 @@ class CorrectedEquations:
         (q, k), by which the parameters of the twin depend on the free ones.
     dropped : frozenset of str
         Names of terms that are left out.
+    opened : bool
+        Whether each equation may depend on all states and commands.
 
     """
 
@@ -117,6 +120,7 @@ class CorrectedEquations:
     visited: tuple[NDArray, NDArray]
     free: NDArray
     dropped: frozenset[str] = frozenset()
+    opened: bool = False
 
     @classmethod
     def distinct(
@@ -126,6 +130,8 @@ class CorrectedEquations:
         settings: Dynamics,
         visited: tuple[NDArray, NDArray],
         free: NDArray,
+        *,
+        opened: bool = False,
     ) -> CorrectedEquations:
         """The equations without the terms that are combinations of others or of theta's effects.
 
@@ -133,7 +139,7 @@ class CorrectedEquations:
 
         Parameters
         ----------
-        twin, form, settings, free
+        twin, form, settings, free, opened
             See the attributes.
         visited : tuple of NDArray
             States (n, T, d_x) and commands (n, T, d_u) of the calibration record.
@@ -144,7 +150,7 @@ class CorrectedEquations:
         speed = np.sqrt(np.mean(steps**2, axis=(0, 1)))
         domain = Domain.visited(x, u, np.where(speed > 0, speed, 1.0))
         x, u = _some(*visited)
-        whole = cls(twin, form, settings, domain, (x, u), free)
+        whole = cls(twin, form, settings, domain, (x, u), free, opened=opened)
         columns = whole.values(x, u)
         dropped, first = set(), 0
         for equation in whole.equations:
@@ -184,6 +190,7 @@ class CorrectedEquations:
             for name in given or ():
                 one_of("depends", name, everything)
             used = [everything.index(each) for each in given] if given else variables_of(twin, i)
+            used = list(range(len(everything))) if self.opened else used
             places = sorted({*used} if given else {i, *used})
             own = [everything[place] for place in places]
             signs = settings.signs(state, own)
@@ -191,7 +198,7 @@ class CorrectedEquations:
             count = sum(place < len(names) for place in places)
             terms = list(self.form.terms(own, count, signs, zeros))
             known = given or any(signs) or state in settings.passive or twin.learned
-            if not (known or _is_rate(twin, i)) and isinstance(self.form, Library):
+            if not (known or self.opened or _is_rate(twin, i)) and isinstance(self.form, Library):
                 terms += self.form.dead_zone(f"{state}'", len(own))
                 places.append(len(everything) + i)
             terms = [each for each in terms if f"{state}: {each.name}" not in self.dropped]
