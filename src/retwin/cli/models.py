@@ -211,9 +211,16 @@ def _note_start(model: Twin, records: Trajectories, begin: float) -> None:
         note("Not inferred by --warm-up: this model starts alike in each record.")
     elif not begin and unknown_starts(model) and records.mask.any():
         note(
-            "The model starts at the mean of its calibration records; --warm-up 5s infers the "
-            "start of each record from the first 5 s that were measured"
+            "The model starts at the mean of its calibration records; --warm-up "
+            f"{_begin_of(records):g}s infers the start of each record from its first measurements"
         )
+
+
+def _begin_of(records: Trajectories) -> float:
+    """A round time in s at the begin of records that is long enough to infer their starts."""
+    from retwin.update.forecasts import BEGIN
+
+    return float(f"{records.lengths.max() / records.rate / BEGIN:.1g}")
 
 
 def _start_remarks(
@@ -225,11 +232,11 @@ def _start_remarks(
 ) -> list[str]:
     """Outputs that are predicted much better from starts that the records themselves give."""
     from retwin.evaluation import score_model
-    from retwin.update.forecasts import BEGIN, unknown_starts
+    from retwin.update.forecasts import unknown_starts
 
     if not unknown_starts(model):
         return []
-    begin = float(f"{records.lengths.max() / records.rate / BEGIN:.1g}")
+    begin = _begin_of(records)
     better = score_model(model, records, warm_up=begin, started=begin, seed=seed)
     found = [
         f"{b.rmse:.4g} in place of {a.rmse:.4g} {units[a.output]} ({a.output})"

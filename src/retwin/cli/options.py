@@ -85,7 +85,7 @@ Horizon = Annotated[
 
 WarmUp = Annotated[
     str,
-    rare("TIME", "Begin of each record that gives its start, and is not scored: 5s.", "--warm-up"),
+    option("TIME", "Begin of each record that gives its start, not scored: 5s.", "--warm-up"),
 ]
 
 

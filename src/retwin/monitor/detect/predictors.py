@@ -23,8 +23,9 @@ from retwin.update.dynamics.filter.prediction import root_of, whitened
 from retwin.update.dynamics.twin import DynamicsTwin
 
 SLOWER = (1e-4, 1e-3, 1e-2, 1e-1)
-"""Factor of the variance of the process noise of the second model, whose filter needs about a
-hundred times as long to follow. Not 0: states that integrate would drift away for ever."""
+"""Factors of the variance of the process noise of the second model, of which the first is taken
+that describes the calibration: with the smallest its filter needs about a hundred times as long to
+follow. Not 0: states that integrate would drift away for ever."""
 
 IMPLAUSIBLE = 100.0
 """Ranges of a command in calibration by which it may leave that range. What is farther away stands
