@@ -83,8 +83,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     for path, name in OUTSIDE.items():
         markdown = re.sub(rf"\]\(\.\./{re.escape(path)}(?=[)#])", f"]({name}", markdown)
     if page.file.src_uri in OUTSIDE.values():
-        markdown = re.sub(r"\]\((?:\.\./)*docs/", "](", markdown)
         markdown = re.sub(rf"\]\(({'|'.join(MEASURED)})\.md", r"](results_\1.md", markdown)
+        markdown = re.sub(r"\]\((?:\.\./)*docs/", "](", markdown)
     name = page.file.src_uri
     if name in EXECUTED or name.startswith("api/"):
         markdown = executed(markdown, re.sub(r"\W", "_", CONTINUED.get(name, name)))
