@@ -237,6 +237,8 @@ def _start_remarks(
     if not unknown_starts(model):
         return []
     begin = _begin_of(records)
+    if not records.mask[:, : round(begin * records.rate)].any(axis=(1, 2)).all():
+        return []  # of some nothing was measured there
     better = score_model(model, records, warm_up=begin, started=begin, seed=seed)
     found = [
         f"{b.rmse:.4g} in place of {a.rmse:.4g} {units[a.output]} ({a.output})"

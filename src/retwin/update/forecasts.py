@@ -264,10 +264,12 @@ def calibrate_forecasts(
     by_lead = times, persistence, deviation, independent
     longest = float(records.lengths.max() / records.rate)
     drifts = errors_drift(np.concatenate(free))
-    return ForecastErrors(*by_lead, memory, low, high, beyond, longest, drifts, _started(found))
+    return ForecastErrors(
+        *by_lead, memory, low, high, beyond, longest, drifts, _calibrate_started(found)
+    )
 
 
-def _started(found: Sequence[LeftOut]) -> NDArray | None:
+def _calibrate_started(found: Sequence[LeftOut]) -> NDArray | None:
     """Deviations (d_y,) of simulations from starts that records give; None where there are none."""
     known = [(each, each.started) for each in found if each.started is not None and not each.edge]
     if not known:

@@ -105,7 +105,7 @@ def predict_records(
     check_channels(model, records, "records")
     errors: ForecastErrors | None = getattr(model, "forecast", None)
     if horizon is None:
-        mean, deviation = _simulated(model, records, started, seed)
+        mean, deviation = _simulate_free(model, records, started, seed)
         if started and errors is not None and errors.started is not None:
             deviation = np.broadcast_to(errors.started, mean.shape)
     else:
@@ -132,7 +132,7 @@ def predict_records(
     return ScoredPrediction(mean, deviation)
 
 
-def _simulated(
+def _simulate_free(
     model: Twin, records: Trajectories, started: float, seed: int
 ) -> tuple[NDArray, NDArray]:
     """Means and deviations of free simulations, with starts by the first measurements or not."""
@@ -234,7 +234,7 @@ def score_model(
     if twin is not None:
         nothing = np.full(measured.shape, np.nan)
         if horizon is None:
-            mean = _simulated(twin, records, started, seed)[0]
+            mean = _simulate_free(twin, records, started, seed)[0]
         else:
             made = forecasts(twin, records, [max(1, round(horizon * records.rate))])
             mean = made.mean[0] + made.last[0]

@@ -363,14 +363,10 @@ def _partial(blocks: NDArray, order: int) -> NDArray:
     )
     correlation = sums / np.maximum(pairs, 1)
     made, variance = np.zeros_like(correlation[1:]), correlation[0].copy()
-    coefficients = made[:0]
-    for k in range(order):  # Levinson's recursion
-        error = correlation[k + 1] - (coefficients * correlation[k:0:-1]).sum(axis=0)
-        made[k] = np.clip(error / variance, -0.99, 0.99)
+    for k in range(order):  # the recursion of Levinson
+        predicted = (_coefficients(made[:k]) * correlation[k:0:-1]).sum(axis=0) if k else 0.0
+        made[k] = np.clip((correlation[k + 1] - predicted) / variance, -0.99, 0.99)
         variance *= 1 - made[k] ** 2
-        coefficients = np.concatenate(
-            [coefficients - made[k] * coefficients[::-1], made[k : k + 1]]
-        )
     found: NDArray = np.arctanh(made / LARGEST_PARTIAL)
     return found
 

@@ -92,12 +92,12 @@ def visible_sizes(
                     unseen = unseen[:middle]
         if np.isfinite(share):  # of a fault that the twin can simulate
             unit = size_unit(fault, monitor.twin)
-            value = _compared(fault, monitor.twin)
+            value = _value_behind(fault, monitor.twin)
             made.append(Visible(name, best, largest, share, within, unit, value))
     return made
 
 
-def _compared(fault: Fault | None, twin: DynamicsTwin) -> float | None:
+def _value_behind(fault: Fault | None, twin: DynamicsTwin) -> float | None:
     """What a fault's size is compared with, see `Visible`."""
     if isinstance(fault, ParameterFault) and not fault.grows:
         values = dict(zip(twin.equations.names, twin.values.tolist(), strict=True))

@@ -48,10 +48,7 @@ def comparison_table(found: Fitted) -> Table:
             )
     heads = ["candidate", *(Column(name, "RMS error") for name in units)]
     how = "free simulation" if found.horizon is None else f"{found.horizon:g} s ahead"
-    title = (
-        f"Errors of parts that were left out ({how}), the simplest candidate first; taken is the "
-        "first whose CRPS is the best, or behind it by no more than its standard error"
-    )
+    title = f"Errors of parts that were left out ({how}), the simplest candidate first"
     return tabulate(title, [*heads, "CRPS", "behind the best", "90 % bands hold", "time"], rows)
 
 
