@@ -45,6 +45,7 @@ FOLDED = tuple(f"results_{part}.md" for part in ("arm", "systems", "monitor", "s
 MEASURED = tuple(Path(name).stem for name in OUTSIDE if name.startswith("benchmarks/"))
 """The files of results."""
 TABLE = re.compile(r"^\|.*\n(?:\|.*\n?){3,}", re.MULTILINE)
+TAB = re.compile(r'<input[^>]* id="([^"]+)"')
 DETAILS = '<details markdown="1"><summary>Table</summary>\n\n{table}\n\n</details>\n'
 ABOUT_COMMANDS = """
 Results go to stdout; progress, notes, warnings and errors to stderr. `retwin --quiet …`, or
@@ -89,6 +90,11 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     if name in EXECUTED or name.startswith("api/"):
         markdown = executed(markdown, re.sub(r"\W", "_", CONTINUED.get(name, name)))
     return folded(markdown) if name in FOLDED else markdown
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> None:
+    """Tabs get their anchors after MkDocs has collected those of a page, so collect them here."""
+    page.present_anchor_ids |= set(TAB.findall(html))
 
 
 def folded(markdown: str) -> str:
