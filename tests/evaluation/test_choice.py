@@ -146,25 +146,31 @@ def test_bands_hold_what_they_promise_of_other_records() -> None:
         assert own.width < 1.6 * 3.29 * own.rmse
 
 
+def unstarted() -> StateTwin:
+    """The twin without what its state is at the first sample."""
+    twin = twin_of()
+    return StateTwin(
+        (State("heat", "K", low=-20.0, high=20.0),), twin.output, INPUTS, OUTPUTS, 1.0,
+        derivative=twin.derivative, parameters=twin.parameters,
+    )  # fmt: skip
+
+
+def begun(*seeds: int, slope: Callable[[float, float], float], loss: float) -> rt.Trajectories:
+    """Records that begin in states of their own, from which the heater cools by that loss."""
+    data = records(*seeds, slope=slope, steps=300)
+    start = np.random.default_rng(seeds).uniform(-8, 8, size=(len(seeds), 1, 1))
+    return data.replace(
+        observed=data.observed + start * np.exp(-loss * np.arange(300))[None, :, None]
+    )
+
+
 @pytest.mark.slow
 def test_bands_hold_where_records_begin_in_other_states(tmp_path: Path) -> None:
     """The band is wide at the start alone: its mean square says nothing of the time after it."""
-    twin = twin_of()
-    states = (State("heat", "K", low=-20.0, high=20.0),)
-    twin = StateTwin(
-        states, lambda x, u, p: x.heat, INPUTS, OUTPUTS, 1.0,
-        derivative=lambda x, u, p: (p.gain * u.power - p.loss * x.heat,),
-        parameters=twin.parameters,
-    )  # fmt: skip
-
-    def begun(*seeds: int) -> rt.Trajectories:
-        data = records(*seeds, slope=radiating, steps=300)
-        start = np.random.default_rng(seeds).uniform(-8, 8, size=(len(seeds), 1, 1))
-        decay = start * np.exp(-0.12 * np.arange(300))[None, :, None]
-        return data.replace(observed=data.observed + decay)
-
-    found = rt.fit(twin, begun(1, 2, 3, 4, 5), rt.Choice(method="dynamics", candidates=FAST))
-    fresh = begun(11, 12, 13)
+    twin = unstarted()
+    data = begun(1, 2, 3, 4, 5, slope=radiating, loss=0.12)
+    found = rt.fit(twin, data, rt.Choice(method="dynamics", candidates=FAST))
+    fresh = begun(11, 12, 13, slope=radiating, loss=0.12)
     held = predict_records(found.twin, fresh)
     later = np.abs(fresh.observed - held.mean)[:, 60:] <= 1.645 * held.deviation[:, 60:]
     assert later.mean() > 0.85
@@ -184,6 +190,30 @@ def test_bands_hold_where_records_begin_in_other_states(tmp_path: Path) -> None:
     errors = {each.who: each.rmse for each in rows}
     (model, *_) = rt.score_model(found.twin, fresh, warm_up=10.0)
     assert errors["model"] < min(0.5 * model.rmse, errors["twin"])
+
+
+def test_candidates_are_compared_from_starts_that_the_records_give(tmp_path: Path) -> None:
+    """The mean of the starts predicts none of them, which hides how good a right twin is."""
+    choice = rt.Choice(candidates=("none", "parameters"))
+    data = begun(1, 2, 3, 4, 5, slope=right, loss=0.08)
+    found = rt.fit(unstarted(), data, choice)
+    assert found.chosen == "parameters"
+    assert found.begin == 30.0
+    assert found.score("parameters").rmse["heat"] < 0.012
+    assert 0.85 < found.score("parameters").coverage < 0.95
+    assert any("Candidates were compared so, too." in each for each in found.remarks)
+    assert "from starts that the first 30 s of a record give" in fit_page(found, "model", title="")
+    found.twin.save(tmp_path / "model")
+    fresh = begun(11, 12, 13, slope=right, loss=0.08)
+    for model in (found.twin, rt.load_twin(tmp_path / "model")):
+        assert model.unknown_starts
+        rows = {each.who: each for each in rt.score_model(model, fresh, warm_up=30, started=30)}
+        assert rows["model"].rmse < 0.012
+        assert 0.8 < rows["model"].coverage < 0.97
+    alike = rt.fit(unstarted(), records(1, 2, 3, 4, 5, slope=right, steps=300), choice)
+    assert alike.begin == 0.0
+    with pytest.raises(rt.InputError, match="one whose starts are known"):
+        rt.fit(twin_of(), data[[0]], choice).twin.started(data[[0]])
 
 
 @pytest.mark.slow

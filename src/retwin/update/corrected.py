@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retwin.checks import whole
+from retwin.checks import require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import read_about, refusing, write_model
@@ -75,6 +75,23 @@ class CorrectedTwin(OfTwin):
     def onsets(self) -> NDArray:
         """(k, M) onsets, in s, of the segments of the calibration trajectories."""
         return self.residual.timing / self.rate
+
+    @property
+    def unknown_starts(self) -> bool:
+        """Whether its twin has a state whose start is not known, which `started` infers."""
+        return isinstance(self.surrogate, ExactSurrogate) and self.surrogate.unknown_starts
+
+    def started(self, record: Trajectories) -> CorrectedTwin:
+        """The twin with the unknown starts of one record; see `DynamicsTwin.started`."""
+        require(
+            self.unknown_starts,
+            "record",
+            expected="a model of a StateTwin with unknown starts",
+            got="one whose starts are known, or cannot be set",
+            remedy="simulate it as it is; bounds make a start unknown",
+        )
+        surrogate: Any = self.surrogate
+        return replace(self, surrogate=surrogate.started(record))
 
     def simulate(
         self,

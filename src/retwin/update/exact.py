@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,18 @@ from torch import Tensor, nn
 
 from retwin import catalog
 from retwin.checks import given, require
+from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import kind_of, read_about, refusing, save_model
 from retwin.twins.equations.saved_equations import equations_from, equations_of
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
-from retwin.twins.twin import Twin
+from retwin.twins.twin import Twin, check_channels
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.twins.wrappers.wrapper import OfTwin
+from retwin.update.dynamics.estimation import estimate_starts
 from retwin.update.dynamics.twin import DynamicsTwin
-from retwin.update.dynamics.unknowns import state_names, state_twin_of
+from retwin.update.dynamics.unknowns import Unknowns, state_names, state_twin_of, unknowns_of
 from retwin.update.surrogate import Surrogate
 
 KIND = "twin"
@@ -61,6 +64,38 @@ class ExactSurrogate(OfTwin):
             return self.twin.simulation.most_probable(values)[0].astype(np.float32)
         made = self.twin.simulate(values, seed=0, progress=progress)
         return made.nominal.astype(np.float32)
+
+    @property
+    def unknown_starts(self) -> bool:
+        """Whether it has a state whose start is not known, which `started` infers."""
+        if isinstance(self.twin, DynamicsTwin):
+            return self.twin.unknown_starts
+        return bool(state_names(self.twin)) and len(self._starts.free) > 0
+
+    @property
+    def _starts(self) -> Unknowns:
+        """The starts of the states of a `StateTwin`, at its present values."""
+        base, _, values = state_twin_of(self.twin)  # type: ignore[arg-type]
+        return unknowns_of(base, (), values)
+
+    def started(self, record: Trajectories) -> ExactSurrogate:
+        """The same with the unknown starts of one record; see `DynamicsTwin.started`."""
+        if isinstance(self.twin, DynamicsTwin):
+            return ExactSurrogate(self.twin.started(record), differences=self._warns)
+        check_channels(self.twin, record, "record")
+        base, _, values = state_twin_of(self.twin)  # type: ignore[arg-type]
+        unknowns = self._starts
+        starts, _ = estimate_starts(base, record, unknowns)
+        names = [f"start_{base.states[i].name}" for i in unknowns.free]
+        own = values | dict(zip(names, starts.tolist(), strict=True))
+        return ExactSurrogate(_at_values(base, own), differences=self._warns)
+
+    def fitted_outputs(self, records: Trajectories) -> NDArray:
+        """Nominal outputs (n, T, d_y) from the unknown starts that fit each whole record best."""
+        own = [records[[i]] for i in range(len(records))]
+        starts = (self.started(each) if each.mask.any() else self for each in own)
+        pairs = zip(starts, own, strict=True)
+        return np.concatenate([each.predict(record.commands) for each, record in pairs])
 
     def __call__(self, commands: Tensor) -> Tensor:
         """The same for a tensor; with gradient if the twin can be called with one."""
@@ -149,6 +184,10 @@ def load_surrogate(folder: str | Path, twin: Twin | None = None) -> Surrogate:
 def with_present_values(twin: StateTwin | ParametricTwin) -> StateTwin:
     """The equations of a twin, whose parameters and states start at its present values."""
     base, _, values = state_twin_of(twin)
+    return _at_values(base, values)
+
+
+def _at_values(base: StateTwin, values: Mapping[str, float]) -> StateTwin:
     return replace(
         base,
         parameters=tuple(each.with_start(values[each.name]) for each in base.parameters),

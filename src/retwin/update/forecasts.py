@@ -71,18 +71,28 @@ def free_moments(twin: Twin, commands: NDArray, *, seed: int = 0) -> tuple[NDArr
     return means, deviations
 
 
-def unknown_starts(twin: object) -> TypeGuard[DynamicsTwin]:
+def unknown_starts(twin: object) -> TypeGuard[DynamicsTwin | CorrectedTwin]:
     """Whether a model has states whose starts the begin of a record gives."""
-    return isinstance(twin, DynamicsTwin) and twin.unknown_starts
+    return isinstance(twin, DynamicsTwin | CorrectedTwin) and twin.unknown_starts
+
+
+def begin_of(records: Trajectories) -> float:
+    """The first tenth of each record in s, by which starts are inferred; 0 if one is not measured.
+
+    It is a tenth of the shortest record.
+    """
+    samples = max(1, int(records.lengths.min()) // BEGIN)
+    measured = records.mask[:, :samples].any(axis=(1, 2)).all()
+    return samples / records.rate if measured else 0.0
 
 
 def started_mean(twin: Twin, records: Trajectories) -> NDArray | None:
     """Means of free simulations from starts by the first tenth of each record; see `LeftOut`."""
-    begin = max(1, int(records.lengths.min()) // BEGIN)
-    if not (unknown_starts(twin) and records.mask[:, :begin].any(axis=(1, 2)).all()):
+    begin = begin_of(records)
+    if not (unknown_starts(twin) and begin):
         return None
-    mean = started_moments(twin, records, begin / records.rate)[0]
-    mean[:, :begin] = np.nan
+    mean = started_moments(twin, records, begin)[0]
+    mean[:, : round(begin * records.rate)] = np.nan
     return mean
 
 

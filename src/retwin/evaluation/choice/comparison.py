@@ -14,7 +14,7 @@ from retwin.evaluation.choice.folds import Fold, block_length, block_means
 from retwin.scores.distributions import crps_normal
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.forecast_errors import LEVEL, USUAL
-from retwin.update.forecasts import forecasts, free_moments
+from retwin.update.forecasts import forecasts, free_moments, started_moments
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +39,22 @@ class Predicted:
     propagated: bool = False
 
 
-def predict(model: object, records: Trajectories, fold: Fold, horizon: float | None) -> Predicted:
-    """Predictions of a fold by a model that was not fitted to it, free or `horizon` s ahead."""
+def predict(
+    model: object, records: Trajectories, fold: Fold, horizon: float | None, begin: float = 0.0
+) -> Predicted:
+    """Predictions of a fold by a model that was not fitted to it, free or `horizon` s ahead.
+
+    Free simulations begin where the first `begin` s of each record say, and are scored after that.
+    """
     own = records[fold.rows]
-    mean, deviation = free_moments(model, own.commands)  # type: ignore[arg-type]
+    if horizon is None and begin:
+        mean, deviation = started_moments(model, own, begin)  # type: ignore[arg-type]
+    else:
+        mean, deviation = free_moments(model, own.commands)  # type: ignore[arg-type]
     if horizon is None:
-        propagated = isinstance(model, DynamicsTwin)
-        return Predicted(mean, deviation, np.zeros_like(mean), propagated)
+        last = np.zeros_like(mean)
+        mean[:, : round(begin * records.rate)] = last[:, : round(begin * records.rate)] = np.nan
+        return Predicted(mean, deviation, last, isinstance(model, DynamicsTwin))
     lead = max(1, round(horizon * records.rate))
     made = forecasts(model, own, [lead])  # type: ignore[arg-type]
     return Predicted(made.mean[0], np.ones_like(mean), made.last[0])
@@ -186,6 +195,11 @@ class Comparison:
             inside = np.abs(error) <= USUAL * self.deviation(name, i)
             hits.append(np.where(np.isfinite(error), inside, np.nan).reshape(-1, len(self.spread)))
         return np.asarray(np.nanmean(np.concatenate(hits), axis=0))
+
+    @property
+    def best(self) -> float:
+        """The lowest mean score of a model."""
+        return min(float(self.block_scores(name).mean()) for name in self.predicted)
 
     @property
     def _all(self) -> range:

@@ -83,6 +83,9 @@ class Fitted:
         By parameter: before the fit, identified alone, and in `twin`.
     horizon : float or None
         Time ahead in s at which candidates were judged; None for free simulation.
+    begin : float
+        Time in s at the begin of each record by which the starts of free simulations were inferred,
+        since they differ between records; 0 where they begin as the model does.
     parts : tuple of str
         What was left out in turn; none where nothing was compared.
     measured, predicted, deviation : NDArray
@@ -104,6 +107,7 @@ class Fitted:
     remarks: tuple[str, ...]
     parameters: Mapping[str, tuple[float, float, float]]
     horizon: float | None
+    begin: float
     parts: tuple[str, ...]
     records: Trajectories
     predicted: NDArray
@@ -117,6 +121,15 @@ class Fitted:
         return next(each for each in self.scores if each.name == name)
 
     @property
+    def how(self) -> str:
+        """How candidates predicted the parts that were left out."""
+        if self.horizon is not None:
+            return f"{self.horizon:g} s ahead of the last measurement"
+        if self.begin:
+            return f"free simulation from starts that the first {self.begin:g} s of a record give"
+        return "free simulation from the commands"
+
+    @property
     def values(self) -> dict[str, Any]:
         """The comparison as JSON values."""
         scores = [
@@ -126,6 +139,7 @@ class Fitted:
             "chosen": self.chosen,
             "preferred": self.preferred,
             "horizon": self.horizon,
+            "begin": self.begin,
             "parts": list(self.parts),
             "candidates": scores,
             "remarks": list(self.remarks),

@@ -23,6 +23,7 @@ from retwin.evaluation.choice.comparison import Comparison
 from retwin.evaluation.choice.fitted import CandidateScore, Fitted
 from retwin.evaluation.choice.folds import Fold, block_length, block_means, folds_of
 from retwin.evaluation.choice.remarks import (
+    STARTED,
     correction_remarks,
     remarks_of,
     start_remarks,
@@ -134,21 +135,15 @@ def fit(
         return replace(alone, remarks=(*alone.remarks, *_of_prior(given, others)))
     folds = folds_of(records)
     trials = _run_trials(whole, folds, names, progress)
-    comparison, reasons = trials.compare(settings.horizon)
-    horizon = settings.horizon
-    if horizon is None and unstable(comparison, whole):
-        horizon = shorter(whole)
-        comparison, reasons = trials.compare(horizon)
-    require(
-        comparison.predicted,
-        "twin",
-        expected="simulations that stay finite",
-        got="; ".join(reasons.values()),
-        remedy="identify the twin first, or judge it over a shorter horizon",
-    )
+    free, reasons, horizon = _compare(trials, whole)
+    comparison, begin = free, 0.0
+    if horizon is None and trials.begin:
+        started, failed = trials.compare(None, trials.begin)
+        if started.best < STARTED * free.best:
+            comparison, reasons, begin = started, failed, trials.begin
     preferred, differences = comparison.simplest()
     chosen = settings.method or preferred
-    model = _calibrate(given or whole.fits[chosen](), trials, chosen, comparison)
+    model = _calibrate(given or whole.fits[chosen](), trials, chosen, free)
     scores = tuple(
         _row(name, comparison, differences, trials.seconds[name], reasons.get(name, ""))
         for name in trials.names
@@ -167,12 +162,13 @@ def fit(
         scores=scores,
         remarks=(
             *remarks,
-            *(start_remarks(records, model.forecast) or correction_remarks(scores, chosen)),
+            *(start_remarks(records, model.forecast, begin) or correction_remarks(scores, chosen)),
             *_at_bounds(whole, parameters),
             *_of_prior(model, others),
         ),
         parameters=parameters,
         horizon=horizon,
+        begin=begin,
         parts=tuple(each.name for each in folds),
         records=records,
         predicted=predicted,
@@ -207,6 +203,23 @@ def _run_trials(
     return trials
 
 
+def _compare(trials: Trials, whole: Candidates) -> tuple[Comparison, dict[str, str], float | None]:
+    """The comparison, why some have no score, and the horizon at which candidates are judged."""
+    horizon = whole.settings.horizon
+    comparison, reasons = trials.compare(horizon)
+    if horizon is None and unstable(comparison, whole):
+        horizon = shorter(whole)
+        comparison, reasons = trials.compare(horizon)
+    require(
+        comparison.predicted,
+        "twin",
+        expected="simulations that stay finite",
+        got="; ".join(reasons.values()),
+        remedy="identify the twin first, or judge it over a shorter horizon",
+    )
+    return comparison, reasons, horizon
+
+
 def _fit_alone(
     whole: Candidates, model: Model, taken: float, began: float, checked: Checked
 ) -> Fitted:
@@ -225,6 +238,7 @@ def _fit_alone(
         remarks=(text,),
         parameters=_parameters(whole, model),
         horizon=whole.settings.horizon,
+        begin=0.0,
         parts=(),
         records=whole.records,
         predicted=nothing,
@@ -334,7 +348,7 @@ def with_yardstick(
     fits = partial(_black_boxes, seed)
     trials = Trials(records, folds_of(records), list(BLACK_BOXES), fits, progress)
     trials.run(workers)
-    comparison, reasons = trials.compare(found.horizon)
+    comparison, reasons = trials.compare(found.horizon, found.begin)
     behind = {kind: _behind(found, comparison, kind) for kind in comparison.predicted}
     rows = [
         replace(

@@ -87,8 +87,11 @@ def _describe_uncorrected(
     return [made, text]
 
 
-def start_remarks(records: Trajectories, errors: ForecastErrors | None) -> list[str]:
-    """That errors are mostly those of starts that differ between records."""
+def start_remarks(records: Trajectories, errors: ForecastErrors | None, begin: float) -> list[str]:
+    """That errors are mostly those of starts that differ between records.
+
+    Candidates were compared from starts that the first `begin` s give, or from the mean start (0).
+    """
     if errors is None or errors.started is None:
         return []
     pairs = zip(records.outputs.names, errors.started, errors.deviation[-1], strict=True)
@@ -99,10 +102,11 @@ def start_remarks(records: Trajectories, errors: ForecastErrors | None) -> list[
     ]
     if not found:
         return []
+    compared = " Candidates were compared so, too." if begin else ""
     return [
-        "Records begin in different states, and these simulations at the mean of them. With starts "
-        f"that the first tenth of a record gives, 90 % bands are: {', '.join(found)} (evaluate, "
-        "generate --bands: --warm-up TIME)."
+        "Records begin in different states, and the model at the mean of them. With starts that "
+        f"the first tenth of a record gives, 90 % bands are: {', '.join(found)} (evaluate, "
+        f"generate --bands: --warm-up TIME).{compared}"
     ]
 
 

@@ -17,6 +17,7 @@ from retwin.evaluation.choice.comparison import Comparison, predict
 from retwin.evaluation.choice.folds import Fold
 from retwin.progress import Progress
 from retwin.twins.collected import SimulationError
+from retwin.update.forecasts import begin_of, unknown_starts
 from retwin.workers.jobs import each
 from retwin.workers.threads import one_thread
 
@@ -87,13 +88,24 @@ class Trials:
             if name not in self.reasons:
                 self.models[name] = [models[name] for models, _ in made]
 
-    def compare(self, horizon: float | None) -> tuple[Comparison, dict[str, str]]:
-        """Of the models whose predictions stay finite, and why others have none."""
+    @property
+    def begin(self) -> float:
+        """Time in s at the begin of records that gives their starts; 0 where these are known.
+
+        One record alone has the start that was identified with it.
+        """
+        unknown = any(unknown_starts(made[0]) for made in self.models.values())
+        return begin_of(self.records) if unknown and len(self.records) > 1 else 0.0
+
+    def compare(
+        self, horizon: float | None, begin: float = 0.0
+    ) -> tuple[Comparison, dict[str, str]]:
+        """Of the models whose predictions stay finite, and why others have none; see `predict`."""
         records, reasons, predicted = self.records, dict(self.reasons), {}
         for name in (own for own in self.names if own not in reasons):
             pairs = zip(self.models[name], self.folds, strict=True)
             try:
-                made = [predict(model, records, fold, horizon) for model, fold in pairs]
+                made = [predict(model, records, fold, horizon, begin) for model, fold in pairs]
             except FAILURES as error:
                 reasons[name] = str(error)
                 continue

@@ -47,8 +47,7 @@ def comparison_table(found: Fitted) -> Table:
                 ]
             )
     heads = ["candidate", *(Column(name, "RMS error") for name in units)]
-    how = "free simulation" if found.horizon is None else f"{found.horizon:g} s ahead"
-    title = f"Errors of parts that were left out ({how}), the simplest candidate first"
+    title = f"Errors of parts that were left out ({found.how}), the simplest candidate first"
     return tabulate(title, [*heads, "CRPS", "behind the best", "90 % bands hold", "time"], rows)
 
 

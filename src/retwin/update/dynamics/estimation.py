@@ -15,19 +15,20 @@ trajectories at a time, and only sums of their products are kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.update.dynamics.arrow import Arrow, bounded_step, trust_region_step
 from retwin.update.dynamics.linearised import Linearised, Point
 from retwin.update.dynamics.unknowns import Unknowns
 
-__all__ = ["Estimation", "correlation_time", "root"]
+__all__ = ["Estimation", "correlation_time", "estimate_starts", "root"]
 
 MAX_STEPS = 60
 """Steps of the trust-region method at most."""
@@ -45,6 +46,8 @@ WINDOW = 5
 ACCEPTED = 0.15
 """Ratio of the decrease of the objective to that of its quadratic approximation, from which a step
 is made."""
+ROUNDS = 3
+"""Estimates of the starts of a record, of which each takes the errors of the one before."""
 CHUNK = 2**20
 """Number of derivatives that are computed at once, unless one trajectory has more: 8 MB."""
 
@@ -369,3 +372,42 @@ def correlation_time(residual: NDArray) -> float:
     times = 2 * np.cumsum(covariance / covariance[0]) - 1
     window = np.arange(samples) >= WINDOW * times
     return float(max(1.0, times[np.argmax(window)] if window.any() else times[-1]))
+
+
+def estimate_starts(
+    twin: StateTwin, record: Trajectories, unknowns: Unknowns, variance: NDArray | None = None
+) -> tuple[NDArray, NDArray]:
+    """The most probable starts (m,) of one record, and a root (m, m) of their covariance.
+
+    Parameters
+    ----------
+    twin : StateTwin
+        The equations.
+    record : Trajectories
+        One trajectory, by whose measured samples the starts are estimated.
+    unknowns : Unknowns
+        Starts alone, without shared coordinates.
+    variance : NDArray, optional
+        (d_y,), of the errors of samples, which count as independent; by default their mean square.
+
+    Raises
+    ------
+    InputError
+        Not one trajectory, nothing measured, or no unknown start.
+
+    """
+    require(
+        len(record) == 1 and record.mask.any() and len(unknowns.free) > 0,
+        "record",
+        expected="one trajectory with measured samples, for a twin with unknown starts",
+        got=f"{len(record)} with {int(record.mask.sum())} samples, {len(unknowns.free)} starts",
+        remedy="give the first samples of one record; bounds make a start unknown",
+    )
+    given = np.ones(len(record.outputs)) if variance is None else variance
+    own = Estimation(twin, record, unknowns, record.mask, given)
+    found = own.linearised(Point(np.zeros(0), unknowns.start[None, unknowns.free]))
+    for i in range(1 if variance is not None else ROUNDS):
+        if variance is None:
+            own = replace(own, variance=own.power(found.residual) if i else own.spread)
+        found = own.minimised(found)
+    return found.point.starts[0], root(own.covariance(found))

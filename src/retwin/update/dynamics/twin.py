@@ -21,10 +21,9 @@ from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_
 from retwin.twins.wrappers.wrapper import TwinWrapper, chunk_generator
 from retwin.update.dynamics.discrepancy.curves import Curve, axes_of, curve_of
 from retwin.update.dynamics.discrepancy.domain import Domain
-from retwin.update.dynamics.estimation import Estimation, root
+from retwin.update.dynamics.estimation import estimate_starts
 from retwin.update.dynamics.filter.filtering import DynamicsFilter
 from retwin.update.dynamics.filter.prediction import Prediction
-from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.saved import KIND, read_fields, write_fields
 from retwin.update.dynamics.simulation import FreeSimulation
 from retwin.update.dynamics.unknowns import Unknowns, unknowns_of
@@ -180,24 +179,15 @@ class DynamicsTwin(TwinWrapper):
         """
         check_channels(self, record, "record")
         unknowns = self._starts
-        require(
-            len(record) == 1 and record.mask.any() and len(unknowns.free) > 0,
-            "record",
-            expected="one trajectory with measured samples, for a twin with unknown starts",
-            got=f"{len(record)} with {int(record.mask.sum())} samples, {len(unknowns.free)} starts",
-            remedy="give the first samples of one record; bounds make a start unknown",
-        )
         commands = record.commands.astype(np.float64)
         variance = self.simulation.noise_variance(commands).mean(axis=(0, 1))
-        estimation = Estimation(self.equations, record, unknowns, record.mask, variance)
-        start = Point(np.zeros(0), unknowns.start[None, unknowns.free])
-        found = estimation.minimised(estimation.linearised(start))
+        starts, uncertain = estimate_starts(self.equations, record, unknowns, variance)
         states = len(self.process)
         values, factor = self.values.copy(), self.factor.copy()
-        values[-states:][unknowns.free] = found.point.starts[0]
+        values[-states:][unknowns.free] = starts
         factor[-states:] = 0.0
         own = np.zeros((len(values), len(unknowns.free)))
-        own[len(values) - states + unknowns.free] = root(estimation.covariance(found))
+        own[len(values) - states + unknowns.free] = uncertain
         factor = np.concatenate([factor, own], axis=1)
         return replace(self, values=values, factor=factor, start_deviation=np.zeros(states))
 

@@ -32,7 +32,7 @@ from retwin.update.corrections import (
     sample_mask,
 )
 from retwin.update.corrections.delay_range import bound_note
-from retwin.update.exact import exact_surrogate
+from retwin.update.exact import ExactSurrogate, exact_surrogate
 from retwin.update.residual.bands import coverage_figures
 from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.priors import Priors, other_machines
@@ -157,7 +157,8 @@ def fit_residual(
         The IBG, or a twin in its place (see `ExactSurrogate`).
     calibration : Trajectories
         Real trajectories with commands. Six suffice; from few the distribution is widened, and a
-        warning is given below three.
+        warning is given below three. With one z per sample, unknown starts of a `StateTwin` are
+        those that fit each of several.
     correction : Correction
         The operator g, which defines z. The parameters of a sensor in it are fitted too.
     density : Density, SequenceMixture or StationaryNoise
@@ -218,6 +219,15 @@ def fit_residual(
     rule, parts = _segmented(used, given, needed=not stepwise)
     with training_checked(surrogate, used.commands) as outside:
         context = replace(_context(surrogate, used, parts, faults, twin), others=others)
+        exact: object = surrogate
+        if (
+            stepwise
+            and isinstance(exact, ExactSurrogate)
+            and exact.unknown_starts
+            and len(used) > 1
+        ):
+            # Errors of the mean start are none of the outputs, and differ between records.
+            context = replace(context, nominal=torch.as_tensor(exact.fitted_outputs(used)))
         warn_of_error(context, used)
         correction, found = fit_correction(correction, context, *_measured(used))
     require(
