@@ -109,7 +109,7 @@ class FaultEvidence:
             possible = (end >= first) | (limits[2, 0] == limits[2, 1])
             return np.where(possible, own + self._under(fault, points), -np.inf)
 
-        found = integrate(log_likelihood, limits, np.array([False, True, True]), coverage)
+        found = integrate(log_likelihood, limits, np.array([False, True, True]), coverage, effect=0)
         missing = np.array(
             [not isinstance(fault, SizedFault), False, fault.end is None], dtype=bool
         )

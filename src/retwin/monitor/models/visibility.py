@@ -38,7 +38,7 @@ ONSETS = 20
 """Onsets that are tried of each fault and size, at most."""
 LONGER = 10
 """Samples within which an alarm counts, over those in which a shift by one deviation is seen."""
-HALVINGS = 5
+HALVINGS = 12
 """Times that the largest size is halved, at most."""
 
 
