@@ -136,7 +136,7 @@ def identify(
             text = f"Outputs that no log holds are left out: {', '.join(left_out)}."
             read = replace(read, notes=(*read.notes, text))
         used, held_out = _separated(read, hold_out, seed)
-        note(_plan(opened, used, method))
+        note(_plan(opened, used, held_out, method))
         found = run(
             opened.twin,
             used,
@@ -241,11 +241,15 @@ def _columns(column: list[str] | None, time: str | None, transient: float) -> Co
     return Columns(names, time_column(time or "", "--time"), transient)
 
 
-def _plan(opened: OpenedTwin, used: Any, method: str) -> str:
+def _plan(
+    opened: OpenedTwin, used: Trajectories, held_out: Trajectories | None, method: str
+) -> str:
     """What will be done, in a line."""
     from retwin.report.labels import counted
 
     what = f"{counted(len(used), 'trajectory')} of {used.steps / used.rate:g} s"
+    if held_out is not None:
+        what += f" ({len(held_out)} held out)"
     return f"{what} at {used.rate:g} Hz; {method} for {', '.join(opened.twin.names)}"
 
 

@@ -16,6 +16,8 @@ from retwin.update.identification.posterior import Posterior
 
 WHITE = 0.01
 """p-value below which a residual is not taken for white noise, or depends on an input."""
+MATERIAL = 0.1
+"""Correlation of residuals below which it changes hardly anything, however sure it is."""
 SENTENCES = 4
 """Outputs that have a sentence of their own, at most."""
 SMALL = 0.02
@@ -65,7 +67,7 @@ def state(each: ParameterEstimate) -> str:
         return (
             "not shown to differ from an end of its range"
             if each.leaves
-            else "not identified: other starts of the search fit as well elsewhere"
+            else "not identified: another optimum of the search fits as well"
         )
     leaves = " and leaves it" if each.leaves else ""
     return f"not identified: interval covers {_share(each.covered)} of the range{leaves}"
@@ -110,7 +112,11 @@ def interval_remark(found: Identification) -> str:
 
 def _coloured(found: Identification) -> list[str]:
     """Outputs whose residuals are not white."""
-    return [each.name for each in found.residuals if each.p_white < WHITE]
+    return [
+        each.name
+        for each in found.residuals
+        if each.p_white < WHITE and abs(each.first_correlation) > MATERIAL
+    ]
 
 
 def _driven(found: Identification) -> list[str]:
@@ -119,7 +125,7 @@ def _driven(found: Identification) -> list[str]:
         f"{each.name} on {test.name}"
         for each in found.residuals
         for test in each.inputs
-        if test.p_value < WHITE
+        if test.p_value < WHITE and abs(test.correlation) > MATERIAL
     ]
 
 
@@ -170,7 +176,12 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
         started=any(each.name.startswith("start_") for each in found.parameters),
         own=[each.name for each in found.parameters if each.own],
         unknown=unknown,
-        undetermined=[p for p in unknown if not (p.leaves and (p.covered or 0.0) <= WIDEST)],
+        undetermined=[p for p in unknown if p.covered is None or p.covered > WIDEST],
+        elsewhere=[
+            each.name
+            for each in unknown
+            if each.covered is not None and each.covered <= WIDEST and not each.leaves
+        ],
         depending=[each.name for each in found.parameters if each.depends],
         strong=strong[:SENTENCES],
         coloured=_coloured(found),
