@@ -26,7 +26,14 @@ from retwin.cli.options import (
     seconds_of,
 )
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import read, read_commands, source_of, system_of, updated_twin
+from retwin.cli.reading import (
+    fitted_remarks,
+    read,
+    read_commands,
+    source_of,
+    system_of,
+    updated_twin,
+)
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import Trajectories
@@ -196,6 +203,7 @@ def evaluate(
         f"{count}, {how}:",
         table(heads, rows, numbers=heads[2:6]),
         *_verdict(scores),
+        *fitted_remarks(model, records, "these are no scores of new ones"),
         *([] if ahead or begin else _start_remarks(updated, records, scores, units, seed)),
         as_json=as_json,
     )

@@ -16,6 +16,7 @@ from retwin.data.io import DataCase, load
 from retwin.data.logs.reading import is_log
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
+from retwin.serialisation.files import read_json
 from retwin.serialisation.models import kind_of
 
 if TYPE_CHECKING:
@@ -240,3 +241,22 @@ def shown_records(checked: Checked) -> list[RenderableType]:
     if checked.findings:
         shown += ["", f"{TITLE}:", table(HEADS, finding_rows(checked.findings)), ""]
     return shown
+
+
+def fitted_remarks(model: Path, records: Trajectories, therefore: str) -> list[str]:
+    """Which records a model was fitted to, and what follows from that; none where it is not known.
+
+    `rt.fit` writes their fingerprints beside the model.
+    """
+    from retwin.data.quality.copies import fingerprints
+    from retwin.evaluation.choice.fitted import FILE
+
+    file = model / FILE
+    known = read_json(file).get("fitted_to", []) if file.is_file() else []
+    own = sum(each in known for each in fingerprints(records)) if known else 0
+    if not own:
+        return []
+    return [
+        f"{own} of these {len(records)} records are among those that the model was fitted to, of "
+        f"which its errors are smaller than of others: {therefore}."
+    ]

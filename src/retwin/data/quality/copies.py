@@ -1,9 +1,12 @@
-"""`find_copies` and `distinct_records`: records that were recorded once."""
+"""`find_copies`, `distinct_records` and `fingerprints`: which records are the same."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+from retwin.data.trajectories import Trajectories
+from retwin.serialisation.identity import identity
 
 SHIFT = 3
 """Samples by which copies are shifted, at most."""
@@ -56,6 +59,14 @@ def find_copies(measured: NDArray, *, alike: float = 0.02) -> list[tuple[int, in
 def distinct_records(measured: NDArray) -> NDArray:
     """Indices of the records (n, T, d_y) that are no copies of earlier ones, see `find_copies`."""
     return np.setdiff1d(np.arange(len(measured)), [i for i, _, _ in find_copies(measured)])
+
+
+def fingerprints(records: Trajectories) -> list[str]:
+    """A digest of the measured outputs of each record, by which it is recognised."""
+    return [
+        identity(observed[mask].astype(np.float32))
+        for observed, mask in zip(records.observed, records.mask, strict=True)
+    ]
 
 
 def _difference(one: NDArray, other: NDArray) -> str | None:

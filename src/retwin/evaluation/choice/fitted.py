@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.quality.check import Checked
+from retwin.data.quality.copies import fingerprints
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.files import write_atomically, write_json
 from retwin.update.corrected import CorrectedTwin
@@ -146,6 +147,7 @@ class Fitted:
             "parameters": {name: list(each) for name, each in self.parameters.items()},
             "seconds": self.seconds,
             "records": self.checked.values,
+            "fitted_to": fingerprints(self.records),
             "dynamics": self._learned,
             "residual": self._residual,
             "one_step_errors": self.one_step_errors,

@@ -277,8 +277,11 @@ def _names(candidates: Candidates, settings: Choice) -> list[str]:
         remedy="dynamics need a StateTwin, or a state surrogate of the twin; a delay and an offset "
         "commands that move and rest",
     )
-    simpler = settings.method and not settings.candidates
-    return names[: names.index(settings.method) + 1] if simpler else names
+    if not settings.method or settings.candidates:
+        return names
+    simpler = names[: names.index(settings.method)]
+    per_segment = {"delay_offset", "segments"} - {settings.method}  # dear, and no part of others
+    return [*(each for each in simpler if each not in per_segment), settings.method]
 
 
 def _calibrate(model: Model, trials: Trials, name: str, comparison: Comparison) -> Model:
