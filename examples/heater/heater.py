@@ -5,7 +5,7 @@ from retwin.twins import State, StateTwin
 
 twin = StateTwin(
     states=[State("block", "degC", low=-20.0, high=200.0)],
-    output=lambda x, u: (x.block,),
+    output=lambda x, u: (x.block,),  # or (x, u, p)
     inputs=rt.Channels(("heater", "ambient"), ("W", "degC")),
     outputs=rt.Channels(("block",), ("degC",)),
     rate=1.0,

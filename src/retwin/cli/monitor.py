@@ -33,6 +33,7 @@ from retwin.cli.options import (
 )
 from retwin.cli.reading import (
     case_named,
+    fitted_remarks,
     read,
     read_signals,
     saved,
@@ -58,8 +59,8 @@ EQUATIONS = (
 """What would watch the twin itself, where a black box takes its place."""
 FEW = 6
 """Faults that are listed, at most."""
-EVENT = ("file", "record", "from s", "to s", "what", "cause")
-"""What is shown of an event."""
+NEWER = "; with more samples: "
+"""What stands between a cause and the one after it."""
 CONFIG = Path("monitor.toml")
 Reading = Callable[..., Trajectories]
 """`cli.reading.read` with the options of the command."""
@@ -146,6 +147,7 @@ def fit(
         | {"records": checked.values, "visible": [vars(each) for each in made.visible]},
         *shown_records(checked),
         *([] if known else [box]),
+        *(fitted_remarks(model, given, "the promise may not hold for new ones") if model and known else []),
         _describe_promise(made),
         f"Tried: {tried}",
         *(f"{name}: {text}" for name, text in promises.items()),
@@ -173,20 +175,22 @@ def replay(
         return
     made = Monitor.load(monitor)
     system = case_named(case or made.twin.case or None)
-    found, rows = [], []
+    found, rows = [], list[str]()
     for file in logs:
         record = reading(file, system or _named(made.twin))
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
         found.append((file, record, watched, causes))
-        rows += [(file.name, *row) for row in _event_rows(watched, causes, record.rate)]
+        for trajectory, *row in _event_rows(watched, causes, record.rate):
+            own = f"{file.name}, {trajectory}" if len(record) > 1 else file.name
+            rows.append(_describe_event(own, *row))
     answer(
         {
             "arl": made.arl,
             "promises": {name: str(each) for name, each in made.promises.items()},
             "records": [_json(*each) for each in found],
         },
-        *([table(EVENT, rows)] if rows else []),
+        *rows,
         *(_summary(*each[:3]) for each in found),
         _rates(made, [(each[1], each[2]) for each in found]),
         as_json=as_json,
@@ -423,8 +427,9 @@ def _causes(
         return []
     faults = possible_causes(monitor.twin, system and system.alarm_causes)
     with bar("explain") as show:
-        show("alarms", 0.0)
-        return find_causes(monitor.twin, record, alarms, faults)
+        return find_causes(
+            monitor.twin, record, alarms, faults, progress=lambda share: show("alarms", share)
+        )
 
 
 def _event_rows(
@@ -462,7 +467,7 @@ def _event_rows(
         end = ends.get((first.trajectory, first.event))
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
-        begin, texts = f"{first.time:.6g}", "; with more samples: ".join(map(text, named))
+        begin, texts = f"{first.time:.6g}", NEWER.join(map(text, named))
         if named and before in [(first.trajectory, each.name) for each in named]:
             further += 1
             times = f"{further} time{'s' * (further > 1)}"
@@ -474,6 +479,15 @@ def _event_rows(
             rows.append((first.trajectory, begin, until, what, shown))
         before = (first.trajectory, named[-1].name) if named else ("", "")
     return rows
+
+
+def _describe_event(record: str, begin: str, end: str, what: str, causes: str) -> str:
+    """An event as lines: when and what, and each cause as it became known."""
+    until = ", which lasts" if end == "lasts" else f" to {end} s"
+    lines = [f"{record}, from {begin} s{until}: {what}"]
+    for first, *more in (each.split("; again, or still") for each in causes.split(NEWER)):
+        lines += [first, *(f"again, or still{each}" for each in more)]
+    return "\n    ".join(filter(None, lines))
 
 
 def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
@@ -511,24 +525,24 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     from scipy.stats import poisson
 
     from retwin.monitor.detect.promise import duration, shortest
+    from retwin.monitor.models.visible import SHARE
     from retwin.report.labels import counted
 
     rate = monitor.twin.rate
     samples = sum(int(record.mask.any(axis=2).sum()) for record, _ in found)
     events = sum(each.promised for _, watched in found for each in watched.events)
     bound = duration(shortest(events, samples) / rate)
-    shown = f"{duration(samples / rate)} shows {counted(events, 'event')}"
-    text = (
-        f"This replay of {shown}; if the machine was healthy all the time, that alone bounds their "
-        f"rate at one in {bound} (exact 95 %). {_describe_promise(monitor)}"
-    )
-    hidden = [each.fault for each in monitor.visible if each.hidden]
+    text = f"This replay of {duration(samples / rate)} shows {counted(events, 'event')}"
+    if not events:
+        text += f": at most one false event in {bound} (exact 95 %), if the machine was healthy"
+    text += f". {_describe_promise(monitor)}"
+    hidden = [each for each in monitor.visible if each.hidden]
     if hidden and not events:
-        text += (
-            " Not seen, or only where they are as large as what they change: "
-            f"{', '.join(hidden[:FEW])}{' and others' * (len(hidden) > FEW)}. Smaller faults of "
-            "other kinds than `monitor fit` listed are not seen either."
-        )
+        unseen = [each.fault for each in hidden if each.share < SHARE]
+        large = [f"{each.fault} ({each.shown_size})" for each in hidden if each.share >= SHARE]
+        for kind, names in (("Not seen", unseen), ("Seen only where it is large", large)):
+            others = " and others" * (len(names) > FEW)
+            text += f" {kind}: {', '.join(names[:FEW])}{others}." if names else ""
     if events and poisson.sf(events - 1, samples / monitor.run_length) < monitor.alpha:
         text += (
             " More events were seen than it allows: these are faults, or, if the machine was "

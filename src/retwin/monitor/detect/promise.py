@@ -209,14 +209,14 @@ class Promise:
     def __str__(self) -> str:
         """One sentence for pages, logs and the terminal."""
         others = "".join(
-            f", and those of slower predictions within a factor {each.kappa:g} and a shift of "
-            f"{each.shift:g}"
+            f" (those of slower predictions by {each.kappa:g} and {each.shift:g})"
             for each in self.slower
         )
         return (
             f"On average at least {self.arl:.6g} measured samples "
             f"({duration(self.arl / self.rate)}) pass until a false alarm, "
-            f"as long as {self.slack}{others}. "
+            "as long as the errors of predictions are distributed as in the calibration, whose "
+            f"quantiles {self.slack}{others}. "
             f"Where that is so, it is declared void with a probability of at most {self.alpha:g}."
         )
 

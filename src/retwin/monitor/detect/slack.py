@@ -47,10 +47,7 @@ class Slack:
         finite("shift", self.shift, at_least=0, at_most=3, unit="standard deviations")
 
     def __str__(self) -> str:
-        return (
-            f"quantiles of the scores are within a factor {self.kappa:g} and a shift of "
-            f"{self.shift:g} of the standard Gaussian ones"
-        )
+        return f"may differ by a factor of {self.kappa:g} and by {self.shift:g} standard deviations"
 
     def upper(self, gaussian: NDArray) -> NDArray:
         """The largest quantiles of the class at Gaussian ones."""

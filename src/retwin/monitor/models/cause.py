@@ -16,6 +16,7 @@ from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.inversion.fault_evidence import FaultEvidence
 from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.monitor.models.watched import Alarm
+from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault, ends_of
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
@@ -225,6 +226,7 @@ def find_causes(
     before: int = BEFORE,
     *,
     known_start: bool = True,
+    progress: Progress | None = None,
 ) -> list[Cause]:
     """The causes of alarms, from the samples before each up to it.
 
@@ -247,6 +249,8 @@ def find_causes(
         begin after the last alarm of the event before it, if that is later.
     known_start : bool
         Whether the record starts as those in calibration do; a stream may start anywhere.
+    progress : callable, optional
+        Called with the share of the alarms that is done.
 
     Raises
     ------
@@ -258,7 +262,9 @@ def find_causes(
     ids, found = record.ids.tolist(), list[Cause]()
     newest, inferred = dict[str, Alarm](), dict[tuple[str, int], list[Alarm]]()
     current, latest = dict[tuple[str, int], Cause](), dict[tuple[str, int], Cause]()
-    for alarm in alarms:
+    for number, alarm in enumerate(alarms):
+        if progress is not None:
+            progress(number / len(alarms))
         require(
             alarm.trajectory in ids and alarm.sample < record.steps,
             "alarms",

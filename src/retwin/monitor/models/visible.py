@@ -48,6 +48,15 @@ class Visible:
             return self.share < SHARE
         return self.share < SHARE or abs(self.size) >= abs(self.value)
 
+    @property
+    def shown_size(self) -> str:
+        """The size from which on it is seen, with its unit and as a share of what it changes."""
+        of = f" {self.unit}" if self.unit not in ("", "1") else ""
+        text = f"{abs(self.size or 0.0):.3g}{of}"
+        if self.size is not None and self.value and self.value != 1:
+            text += f", {abs(self.size / self.value):.0%} of the value"
+        return text
+
     def __str__(self) -> str:
         """One line for the terminal."""
         of = f" {self.unit}" if self.unit not in ("", "1") else ""
@@ -58,9 +67,5 @@ class Visible:
                 else f"not seen up to {abs(self.largest):.3g}{of}"
             )
         else:
-            what = "seen"
-            if self.size is not None:
-                what = f"seen from a size of {abs(self.size):.3g}{of} on"
-                if self.value and self.value != 1:
-                    what += f", {abs(self.size / self.value):.0%} of the value"
+            what = "seen" if self.size is None else f"seen from a size of {self.shown_size}"
         return f"{self.fault}: {what} ({self.share:.0%} within {self.within:.3g} s)"

@@ -61,5 +61,6 @@ def term_table(found: Fitted) -> Table:
     """The largest terms that state equations learned."""
     terms = {} if found.learned is None else found.learned.terms
     rows = [[name, f"{size:.3f}"] for name, size in list(terms.items())[:LARGEST]]
-    title = "The largest terms, over the usual time derivative of their state"
+    title = "The largest terms, over the usual time derivative of their state; variables are in "
+    title += "standard deviations from their means"
     return tabulate(title, ["term", "size"], rows)
