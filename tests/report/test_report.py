@@ -332,7 +332,7 @@ def test_emulated(study: Study, write: Write) -> None:
     text = read(write(study)).text
     assert "EMULATED data: no real measurements" in text
     assert text.count("EMULATED") == 1, "once, where it stays in sight"
-    assert "no answer holds for a real machine" in text
+    assert "none of these is an answer for a real machine" in text
 
 
 def test_no_paper_columns_without_a_paper(study: Study, write: Write) -> None:

@@ -17,9 +17,10 @@ TITLES = {
 }
 """Heads of the rows."""
 RULE = (
-    "“Yes” and “no” need the whole 95 % interval within or outside the requirement; “likely” is a "
-    "value within it whose interval is not, or is that of too few records or trainings; “cannot "
-    "say” is the rest. The best updated source on these runs is shown: expect a little less."
+    "“Yes” and “no”: the whole 95 % interval is within or outside the requirement, from enough "
+    "records and trainings. “Likely”: the value is within it. “Cannot say”: it is outside and its "
+    "interval is not, nothing was measured, or no outcome of so few runs could show it. The best "
+    "source on these runs is shown, which makes it look a little better than it is."
 )
 """The one rule, as a sentence."""
 WIDEST = 0.3
