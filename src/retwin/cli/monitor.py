@@ -147,11 +147,7 @@ def fit(
         | {"records": checked.values, "visible": [vars(each) for each in made.visible]},
         *shown_records(checked),
         *([] if known else [box]),
-        *(
-            fitted_remarks(model, given, "the promise may not hold for new ones")
-            if model and known
-            else []
-        ),
+        *fitted_remarks(known and model, given, "the promise may not hold for new ones"),
         _describe_promise(made),
         f"Tried: {tried}",
         *(f"{name}: {text}" for name, text in promises.items()),

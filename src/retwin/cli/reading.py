@@ -243,7 +243,7 @@ def shown_records(checked: Checked) -> list[RenderableType]:
     return shown
 
 
-def fitted_remarks(model: Path, records: Trajectories, therefore: str) -> list[str]:
+def fitted_remarks(model: Path | None, records: Trajectories, therefore: str) -> list[str]:
     """Which records a model was fitted to, and what follows from that; none where it is not known.
 
     `rt.fit` writes their fingerprints beside the model.
@@ -251,8 +251,8 @@ def fitted_remarks(model: Path, records: Trajectories, therefore: str) -> list[s
     from retwin.data.quality.copies import fingerprints
     from retwin.evaluation.choice.fitted import FILE
 
-    file = model / FILE
-    known = read_json(file).get("fitted_to", []) if file.is_file() else []
+    file = model / FILE if model else None
+    known = read_json(file).get("fitted_to", []) if file and file.is_file() else []
     own = sum(each in known for each in fingerprints(records)) if known else 0
     if not own:
         return []
