@@ -252,6 +252,13 @@ def test_without_a_method_the_records_decide(folder: Path, tmp_path: Path, call)
     rows = {each["who"]: each for each in json.loads(printed)["scores"]}
     assert set(rows) == {"model", "twin", "mean", "hold"}
     assert rows["model"]["rmse"] < 0.5 * min(rows["twin"]["rmse"], rows["mean"]["rmse"])
+    # Scores of records that the model was fitted to are said to be no scores of others.
+    used = tmp_path / "used.npz"
+    rt.save(records(folder / "d.csv")[0], used)
+    for file, seen in ((used, True), (other, False)):
+        code, printed, err = call("evaluate", out, "--real", file, "--horizon", "5s")
+        assert code == 0, err
+        assert ("among those that the model was fitted to" in " ".join(printed.split())) == seen
     bands = tmp_path / "bands.csv"
     code, _, err = call("generate", out, "--commands", other, "--bands", "--out", bands)
     assert code == 0, err
