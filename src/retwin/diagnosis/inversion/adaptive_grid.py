@@ -39,6 +39,11 @@ class Refinement:
         cell.
     rounds : int
         Rounds at most.
+    hopeless : float
+        How many nats behind a rival a hypothesis has no probability left.
+    closing : float
+        Share of its distance to the rival that the last round must have closed for another one,
+        since each round gains less than the one before.
 
     """
 
@@ -48,6 +53,8 @@ class Refinement:
     tolerance: float = 0.05
     max_cell_share: float = 0.03
     rounds: int = 30
+    hopeless: float = 30.0
+    closing: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +87,7 @@ def integrate(
     coverage: float,
     refinement: Refinement = Refinement(),
     effect: int | None = None,
+    rival: float = -np.inf,
 ) -> Integral:
     """Integrate a likelihood over a box.
 
@@ -101,6 +109,9 @@ def integrate(
         Which cells are refined.
     effect : int, optional
         The quantity whose value 0 is no effect, if its limits include 0.
+    rival : float
+        Log evidence of another hypothesis. One that is so far behind that it cannot come close is
+        integrated no further; its intervals are then as wide as its cells.
 
     """
     is_open = limits[:, 1] > limits[:, 0]
@@ -150,6 +161,9 @@ def integrate(
         cells = np.concatenate([np.delete(cells, chosen, axis=0), parts])
         mass = np.concatenate([np.delete(mass, chosen), log_mass(parts)])
         before, total = total, _total(mass)
+        behind = rival - total
+        if behind > refinement.hopeless and total - before < refinement.closing * behind:
+            break
         if abs(total - before) < refinement.tolerance and mass.max() < total + np.log(
             refinement.max_cell_share
         ):
@@ -186,10 +200,14 @@ def _halves(cell: NDArray, whole: NDArray) -> NDArray:
 def _summary(weight: NDArray, ends: NDArray, coverage: float) -> tuple[float, float, float]:
     """Lower end, mean and upper end of a quantity that is uniform in each cell (J, 2)."""
     mean = float(weight @ ends.mean(axis=1))
-    edges = np.unique(ends)
-    width = np.maximum(ends[:, 1] - ends[:, 0], 1e-300)
-    # The distribution function at each edge: every cell contributes the part of it below.
-    below = weight @ np.clip((edges - ends[:, :1]) / width[:, None], 0.0, 1.0)
+    edges, place = np.unique(ends, return_inverse=True)
+    if len(edges) == 1:  # of a known quantity
+        return mean, mean, mean
+    first, last = place.reshape(ends.shape).T
+    density = weight / (ends[:, 1] - ends[:, 0])
+    change = np.bincount(first, density, len(edges)) - np.bincount(last, density, len(edges))
+    # The distribution function at each edge.
+    below = np.append(0.0, np.cumsum(np.cumsum(change)[:-1] * np.diff(edges)))
     low, high = (
         float(np.interp(level, below, edges)) for level in ((1 - coverage) / 2, (1 + coverage) / 2)
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.inversion.adaptive_grid import Integral, integrate
+from retwin.diagnosis.inversion.adaptive_grid import Integral, Refinement, integrate
 from retwin.twins.faults.actuator_faults import ends_of
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
@@ -85,13 +85,22 @@ class FaultEvidence:
         errors = whitened(measured - mean, root_of(covariance, seen), seen)
         return float(np.abs(errors).max()) if np.isfinite(errors).all() else np.inf
 
-    def integral(self, fault: TimedFault | None, *, coverage: float = 0.9) -> Integral:
+    def integral(
+        self,
+        fault: TimedFault | None,
+        *,
+        coverage: float = 0.9,
+        refinement: Refinement = Refinement(),  # noqa: B008 - frozen
+        rival: float = -np.inf,
+    ) -> Integral:
         """The evidence for a fault, and the posterior of its size, onset and end.
 
         Parameters
         ----------
         coverage : float, default 0.9
             Coverage of all intervals.
+        refinement, rival
+            See `integrate`.
 
         """
         steps, rate = len(self.record.commands), self.twin.rate
@@ -109,7 +118,9 @@ class FaultEvidence:
             possible = (end >= first) | (limits[2, 0] == limits[2, 1])
             return np.where(possible, own + self._under(fault, points), -np.inf)
 
-        found = integrate(log_likelihood, limits, np.array([False, True, True]), coverage, effect=0)
+        found = integrate(
+            log_likelihood, limits, np.array([False, True, True]), coverage, refinement, 0, rival
+        )
         missing = np.array(
             [not isinstance(fault, SizedFault), False, fault.end is None], dtype=bool
         )
