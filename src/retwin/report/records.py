@@ -70,7 +70,7 @@ def records_figure(checked: Checked) -> Figure | None:
     panels = [_panel(checked, *place) for place in places[:PICTURES]]
     keys = [Key("measured", "ink"), Key("where it is", "alarm", "bar")]
     if "healthy" in checked.explained or "faulty" in checked.explained:
-        keys.insert(1, Key("twin as it was given", "c0"))
+        keys.insert(1, Key("twin that was given", "c0"))
     return Figure("records", panels, keys)
 
 

@@ -45,7 +45,7 @@ class Checked:
             own = ", ".join(_describe_share(name, share) for name, share in shares.items())
             which = "" if len(self.explained) == 1 else f" in {kind} records"
             parts += [f"{own}{which}"] * bool(own)
-        return [f"The twin as it was given explains {'; '.join(parts)} (variance)."] * bool(parts)
+        return [f"The twin that was given explains {'; '.join(parts)} (variance)."] * bool(parts)
 
     @property
     def values(self) -> dict[str, Any]:
