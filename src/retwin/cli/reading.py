@@ -256,7 +256,5 @@ def fitted_remarks(model: Path | None, records: Trajectories, therefore: str) ->
     own = sum(each in known for each in fingerprints(records)) if known else 0
     if not own:
         return []
-    return [
-        f"{own} of these {len(records)} records are among those that the model was fitted to, of "
-        f"which its errors are smaller than of others: {therefore}."
-    ]
+    which = "these records" if own == len(records) else f"{own} of these {len(records)} records"
+    return [f"The model was fitted to {which}, where its errors are smaller: {therefore}."]

@@ -63,9 +63,8 @@ UNSTABLE = (
 """What is said where candidates were judged over a shorter time than was asked for."""
 
 IDENTIFIED = (
-    "The parameters of the twin were identified by these records: no part that is left out is new "
-    "to the twin as it is. In its place, parameters that are identified without each part are "
-    "scored."
+    "These records have identified the parameters of the twin, so that none of them is new to it. "
+    "In its place a twin is scored whose parameters are identified without the part left out."
 )
 """Why the twin as it is has no row in the comparison."""
 
