@@ -569,10 +569,10 @@ def test_a_twin_that_was_identified_by_the_records_is_judged_without_each_part()
     names = ("parameters", "output")
     found = rt.fit(twin_of(), data, rt.Choice(identified=True, method="output"))
     assert tuple(each.name for each in found.scores)[:1] == names[:1]
-    assert any("identified by these records" in each for each in found.remarks)
+    assert any("have identified the parameters" in each for each in found.remarks)
     named = rt.fit(twin_of(), data, rt.Choice(candidates=FAST[:2], identified=True))
     assert [each.name for each in named.scores] == list(FAST[:2])
-    assert not any("identified by these records" in each for each in named.remarks)
+    assert not any("have identified the parameters" in each for each in named.remarks)
 
 
 def test_a_parameter_at_an_end_of_its_range_is_named() -> None:
