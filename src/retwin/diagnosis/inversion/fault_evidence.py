@@ -129,27 +129,32 @@ class FaultEvidence:
             np.where(missing, np.nan, e / scale) for e in (found.low, found.mean, found.high)
         )
         if not missing[0] and np.isfinite(found.evidence):
-            more = self._error_inflation(fault, found.best)
+            more = np.sqrt(self.dispersion(fault, found.best, since_onset=True))
             low[0] = max(sizes[0], mean[0] - more * (mean[0] - low[0]))
             high[0] = min(sizes[1], mean[0] + more * (high[0] - mean[0]))
         return Integral(found.evidence, found.best, low, mean, high)
 
-    def _error_inflation(self, fault: TimedFault, point: NDArray) -> float:
-        """By how much a size is more uncertain than it would be if predictions were right.
+    def dispersion(
+        self, fault: TimedFault | None, point: NDArray, *, since_onset: bool = False
+    ) -> float:
+        """The long-run variance of the standardised errors with a fault, at least 1.
 
-        It is the square root of the long-run variance of the standardised errors since the onset,
-        which are independent and of variance 1 where the twin with the fault lacks nothing.
+        They are independent and of variance 1 where the twin with the fault lacks nothing. By
+        that factor the variance of a size is larger than its likelihood says, and log likelihoods
+        differ by less (Pauli, Racugno and Ventura, "Bayesian composite marginal likelihoods",
+        Statistica Sinica 21, 2011).
         """
         variants, _ = self._inputs(fault, point[None])
         _, measured, seen, _ = self.record.inputs(variants)
         mean, covariance, _ = self.record.filtered(variants)
         errors = whitened(measured - mean, root_of(covariance, seen), seen)
         used = seen & _active(point[None], len(self.record.commands))[..., None]
+        used = used if since_onset else seen
         errors = np.where(used, errors, 0.0)
         if not np.isfinite(errors).all() or not errors.any():
             return 1.0
         variance = np.sum(errors**2) / used.sum()
-        return float(np.sqrt(max(1.0, variance * correlation_time(errors))))
+        return float(max(1.0, variance * correlation_time(errors)))
 
     def tolerated(
         self, fault: TimedFault | None, found: Integral, *, tolerance: float = 0.1

@@ -9,7 +9,7 @@ fault explains is `unknown`: process and measurement noise that are larger than 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +55,9 @@ class StateDiagnosis:
     unknown : NDArray
         (n,), the probability that none of them is.
     evidence : NDArray
-        (n, C + 1), log marginal likelihood of the outputs for each class and for `unknown`.
+        (n, C + 1), log marginal likelihood of the outputs for each class and for `unknown`; its
+        differences are divided by the long-run variance of the errors with the most probable class,
+        which is 1 unless the twin lacks something.
     size, onset, end : Estimate
         (n, C), size of each fault in the unit of what it changes, and its times in s; NaN where a
         class has none.
@@ -243,16 +245,25 @@ class StateInversionDiagnoser:
         row = self._compete(record) if compete else [record.integral(each) for each in faults]
         unknown = record.unknown(faults, row)
         row = [record.tolerated(*each) for each in zip(faults, row, strict=True)]
-        return [*row, Integral(unknown, *[NOTHING] * 4)]
+        row.append(Integral(unknown, *[NOTHING] * 4))
+        evidence = np.array([each.evidence for each in row])
+        leading = int(evidence[:-1].argmax())
+        if not np.isfinite(evidence[leading]):
+            return row
+        nats, top = record.dispersion(list(faults)[leading], row[leading].best), evidence.max()
+        evidence = top - (top - evidence) / nats
+        return [replace(e, evidence=own) for e, own in zip(row, evidence.tolist(), strict=True)]
 
     def _compete(self, record: FaultEvidence) -> list[Integral]:
         """Integrals of all faults, the most promising first, since others need not be exact."""
         faults = list(self.faults.values())
         rough = [record.integral(each, refinement=ROUGH).evidence for each in faults]
-        row, best = dict[int, Integral](), -np.inf
+        row, best, exact = dict[int, Integral](), -np.inf, Refinement()
         for i in np.argsort(rough)[::-1].tolist():
-            row[i] = record.integral(faults[i], rival=best)
-            best = max(best, row[i].evidence)
+            row[i] = record.integral(faults[i], refinement=exact, rival=best)
+            if row[i].evidence > best:
+                best, nats = row[i].evidence, record.dispersion(faults[i], row[i].best)
+                exact = Refinement(hopeless=nats * Refinement.hopeless)
         return [row[i] for i in range(len(faults))]
 
     def save(self, folder: str | Path) -> None:
