@@ -138,7 +138,7 @@ def fit(
     comparison, begin = free, 0.0
     if horizon is None and trials.begin:
         started, failed = trials.compare(None, trials.begin)
-        if started.best < STARTED * free.best:
+        if started.predicted and started.best < STARTED * free.best:
             comparison, reasons, begin = started, failed, trials.begin
     preferred, differences = comparison.simplest()
     chosen = settings.method or preferred
