@@ -39,11 +39,6 @@ class Refinement:
         cell.
     rounds : int
         Rounds at most.
-    hopeless : float
-        How many nats behind a rival a hypothesis has no probability left.
-    closing : float
-        Share of its distance to the rival that the last round must have closed for another one,
-        since each round gains less than the one before.
 
     """
 
@@ -53,8 +48,6 @@ class Refinement:
     tolerance: float = 0.05
     max_cell_share: float = 0.03
     rounds: int = 30
-    hopeless: float = 30.0
-    closing: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +80,6 @@ def integrate(
     coverage: float,
     refinement: Refinement = Refinement(),
     effect: int | None = None,
-    rival: float = -np.inf,
 ) -> Integral:
     """Integrate a likelihood over a box.
 
@@ -109,9 +101,6 @@ def integrate(
         Which cells are refined.
     effect : int, optional
         The quantity whose value 0 is no effect, if its limits include 0.
-    rival : float
-        Log evidence of another hypothesis. One that is so far behind that it cannot come close is
-        integrated no further; its intervals are then as wide as its cells.
 
     """
     is_open = limits[:, 1] > limits[:, 0]
@@ -161,9 +150,6 @@ def integrate(
         cells = np.concatenate([np.delete(cells, chosen, axis=0), parts])
         mass = np.concatenate([np.delete(mass, chosen), log_mass(parts)])
         before, total = total, _total(mass)
-        behind = rival - total
-        if behind > refinement.hopeless and total - before < refinement.closing * behind:
-            break
         if abs(total - before) < refinement.tolerance and mass.max() < total + np.log(
             refinement.max_cell_share
         ):

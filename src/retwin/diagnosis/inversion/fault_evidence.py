@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.inversion.adaptive_grid import Integral, Refinement, integrate
+from retwin.diagnosis.inversion.adaptive_grid import Integral, integrate
 from retwin.twins.faults.actuator_faults import ends_of
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
@@ -85,22 +85,13 @@ class FaultEvidence:
         errors = whitened(measured - mean, root_of(covariance, seen), seen)
         return float(np.abs(errors).max()) if np.isfinite(errors).all() else np.inf
 
-    def integral(
-        self,
-        fault: TimedFault | None,
-        *,
-        coverage: float = 0.9,
-        refinement: Refinement = Refinement(),  # noqa: B008 - frozen
-        rival: float = -np.inf,
-    ) -> Integral:
+    def integral(self, fault: TimedFault | None, *, coverage: float = 0.9) -> Integral:
         """The evidence for a fault, and the posterior of its size, onset and end.
 
         Parameters
         ----------
         coverage : float, default 0.9
             Coverage of all intervals.
-        refinement, rival
-            See `integrate`.
 
         """
         steps, rate = len(self.record.commands), self.twin.rate
@@ -118,9 +109,8 @@ class FaultEvidence:
             possible = (end >= first) | (limits[2, 0] == limits[2, 1])
             return np.where(possible, own + self._under(fault, points), -np.inf)
 
-        found = integrate(
-            log_likelihood, limits, np.array([False, True, True]), coverage, refinement, 0, rival
-        )
+        whole = np.array([False, True, True])
+        found = integrate(log_likelihood, limits, whole, coverage, effect=0)
         missing = np.array(
             [not isinstance(fault, SizedFault), False, fault.end is None], dtype=bool
         )
@@ -129,14 +119,12 @@ class FaultEvidence:
             np.where(missing, np.nan, e / scale) for e in (found.low, found.mean, found.high)
         )
         if not missing[0] and np.isfinite(found.evidence):
-            more = np.sqrt(self.dispersion(fault, found.best, since_onset=True))
+            more = np.sqrt(self.dispersion(fault, found.best))
             low[0] = max(sizes[0], mean[0] - more * (mean[0] - low[0]))
             high[0] = min(sizes[1], mean[0] + more * (high[0] - mean[0]))
         return Integral(found.evidence, found.best, low, mean, high)
 
-    def dispersion(
-        self, fault: TimedFault | None, point: NDArray, *, since_onset: bool = False
-    ) -> float:
+    def dispersion(self, fault: TimedFault | None, point: NDArray) -> float:
         """The long-run variance of the standardised errors with a fault, at least 1.
 
         They are independent and of variance 1 where the twin with the fault lacks nothing. By
@@ -148,12 +136,10 @@ class FaultEvidence:
         _, measured, seen, _ = self.record.inputs(variants)
         mean, covariance, _ = self.record.filtered(variants)
         errors = whitened(measured - mean, root_of(covariance, seen), seen)
-        used = seen & _active(point[None], len(self.record.commands))[..., None]
-        used = used if since_onset else seen
-        errors = np.where(used, errors, 0.0)
+        errors = np.where(seen, errors, 0.0)
         if not np.isfinite(errors).all() or not errors.any():
             return 1.0
-        variance = np.sum(errors**2) / used.sum()
+        variance = np.sum(errors**2) / seen.sum()
         return float(max(1.0, variance * correlation_time(errors)))
 
     def tolerated(

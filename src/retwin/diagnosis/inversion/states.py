@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 from retwin.checks import nothing, require
 from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.estimate import Estimate, ImplausibleError
-from retwin.diagnosis.inversion.adaptive_grid import Integral, Refinement
+from retwin.diagnosis.inversion.adaptive_grid import Integral
 from retwin.diagnosis.inversion.fault_evidence import NOTHING, FaultEvidence
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
@@ -36,10 +36,6 @@ UNEXPLAINED = "larger noise than in calibration explains the outputs better than
 """The reason for which a trajectory is unknown."""
 KINDS = tuple(kind for kind in FAULTS if issubclass(kind, TimedFault))
 """The faults that can be inverted."""
-
-
-ROUGH = Refinement(rounds=1)
-"""By which faults are put in the order in which they are integrated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +142,6 @@ class StateInversionDiagnoser:
         trajectories: Trajectories,
         *,
         known_start: bool = True,
-        compete: bool = False,
         progress: Progress | None = None,
     ) -> StateDiagnosis:
         """Probabilities, sizes and times of every fault; classes are equally probable beforehand.
@@ -158,9 +153,6 @@ class StateInversionDiagnoser:
         known_start : bool, default True
             Whether they start as those in calibration do. The states at the start of a window may
             be anywhere in their range in calibration.
-        compete : bool, default False
-            Whether sizes and times of classes without any probability may be rough, which is
-            several times faster.
         progress : callable, optional
             Called with the finished fraction, from 0 to 1.
 
@@ -188,7 +180,7 @@ class StateInversionDiagnoser:
         )
         found = []
         single = [trajectories[i : i + 1] for i in range(len(trajectories))]
-        for row in in_threads(lambda each: self._integrals(each, known_start, compete), single):
+        for row in in_threads(lambda each: self._integrals(each, known_start), single):
             found.append(row)
             if progress is not None:
                 progress(len(found) / len(trajectories))
@@ -216,12 +208,7 @@ class StateInversionDiagnoser:
         )
 
     def _integrals(
-        self,
-        trajectory: Trajectories,
-        known_start: bool,
-        compete: bool,
-        *,
-        implausible: float = 1e6,
+        self, trajectory: Trajectories, known_start: bool, *, implausible: float = 1e6
     ) -> list[Integral]:
         """Those of all faults for one trajectory, and of something else besides.
 
@@ -242,7 +229,7 @@ class StateInversionDiagnoser:
                 remedy="check their units, and mask values that stand for missing ones",
             )
         faults = self.faults.values()
-        row = self._compete(record) if compete else [record.integral(each) for each in faults]
+        row = [record.integral(fault) for fault in faults]
         unknown = record.unknown(faults, row)
         row = [record.tolerated(*each) for each in zip(faults, row, strict=True)]
         row.append(Integral(unknown, *[NOTHING] * 4))
@@ -253,18 +240,6 @@ class StateInversionDiagnoser:
         nats, top = record.dispersion(list(faults)[leading], row[leading].best), evidence.max()
         evidence = top - (top - evidence) / nats
         return [replace(e, evidence=own) for e, own in zip(row, evidence.tolist(), strict=True)]
-
-    def _compete(self, record: FaultEvidence) -> list[Integral]:
-        """Integrals of all faults, the most promising first, since others need not be exact."""
-        faults = list(self.faults.values())
-        rough = [record.integral(each, refinement=ROUGH).evidence for each in faults]
-        row, best, exact = dict[int, Integral](), -np.inf, Refinement()
-        for i in np.argsort(rough)[::-1].tolist():
-            row[i] = record.integral(faults[i], refinement=exact, rival=best)
-            if row[i].evidence > best:
-                best, nats = row[i].evidence, record.dispersion(faults[i], row[i].best)
-                exact = Refinement(hopeless=nats * Refinement.hopeless)
-        return [row[i] for i in range(len(faults))]
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with the twin inside, or nothing."""

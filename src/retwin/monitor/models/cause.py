@@ -387,7 +387,7 @@ def _infer(
     begin, latest = first / record.rate, (alarm.sample - first) / record.rate
     lasting = {name: _lasting(fault, latest) for name, fault in faults.items()}
     made = StateInversionDiagnoser(moved(twin, alarm.machine), lasting).diagnose(
-        _window(record, first, alarm.sample), known_start=known_start, compete=True
+        _window(record, first, alarm.sample), known_start=known_start
     )
     best = int(made.probabilities[0].argmax())
 
