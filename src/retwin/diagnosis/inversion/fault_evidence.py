@@ -127,18 +127,24 @@ class FaultEvidence:
     def dispersion(self, fault: TimedFault | None, point: NDArray) -> float:
         """The long-run variance of the standardised errors with a fault, at least 1.
 
-        They are independent and of variance 1 where the twin with the fault lacks nothing. By
-        that factor the variance of a size is larger than its likelihood says, and log likelihoods
-        differ by less (Pauli, Racugno and Ventura, "Bayesian composite marginal likelihoods",
-        Statistica Sinica 21, 2011).
+        They are those with the parameters that are most probable then, independent and of variance
+        1 where the twin with the fault lacks nothing. By that factor the variance of a size is
+        larger than its likelihood says, and log likelihoods differ by less (Pauli, Racugno and
+        Ventura, "Bayesian composite marginal likelihoods", Statistica Sinica 21, 2011).
         """
         variants, _ = self._inputs(fault, point[None])
         _, measured, seen, _ = self.record.inputs(variants)
         mean, covariance, _ = self.record.filtered(variants)
-        errors = whitened(measured - mean, root_of(covariance, seen), seen)
-        errors = np.where(seen, errors, 0.0)
+        factor = root_of(covariance, seen)
+        errors = np.where(seen, whitened(measured - mean, factor, seen), 0.0)
         if not np.isfinite(errors).all() or not errors.any():
             return 1.0
+        by_parameters = np.where(seen[0, ..., None], self._by_parameters, 0.0)
+        slopes = np.linalg.solve(factor[0], by_parameters).reshape(errors.size, -1)
+        curvature = slopes.T @ slopes + np.eye(slopes.shape[1])
+        errors = errors - (slopes @ np.linalg.solve(curvature, slopes.T @ errors.ravel())).reshape(
+            errors.shape
+        )
         variance = np.sum(errors**2) / seen.sum()
         return float(max(1.0, variance * correlation_time(errors)))
 
