@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 import retwin as rt
 from retwin.cli.models import _verdict
@@ -395,6 +396,18 @@ def test_an_identification_is_named_where_a_model_is_expected(tmp_path: Path) ->
     (tmp_path / "identification.json").write_text("{}")
     with pytest.raises(rt.InputError, match="the folder of an identification"):
         rt.load_twin(tmp_path)
+
+
+def test_a_missing_lag_is_mentioned_as_one_and_not_as_a_dead_time() -> None:
+    """A sensor that follows with a time constant of 12 s."""
+    data = records(1, 2, slope=right, steps=300)
+    kept = np.exp(-1 / 12)
+    late = lfilter([1 - kept], [1, -kept], data.observed.astype(float), axis=1)
+    twin = twin_of().parametric().with_values((0.3, 0.08))
+    found = rt.fit(twin, data.replace(observed=late), rt.Choice(candidates=("none",)))
+    (said,) = [each for each in found.remarks if "lag of" in each]
+    assert 8 < float(said.split("lag of ")[1].split()[0]) < 16
+    assert not any("dead time" in each for each in found.remarks)
 
 
 def test_no_dead_time_is_mentioned_of_an_output_that_never_changes() -> None:

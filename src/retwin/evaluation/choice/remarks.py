@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from retwin.data.trajectories import Trajectories
 from retwin.evaluation.choice.comparison import Comparison
@@ -139,16 +140,21 @@ def _worse_than_mean(records: Trajectories, score: CandidateScore) -> list[str]:
 def _of_twin(
     records: Trajectories, comparison: Comparison, name: str, *, explained: float = 0.2
 ) -> list[str]:
-    """A missing dead time of the twin, by its own simulations.
+    """A missing dead time or lag of the twin, by its own simulations.
 
     Parameters
     ----------
     explained : float, default 0.2
-        Share of the mean square error of the twin from which on a dead time is mentioned.
+        Share of the mean square error of the twin from which on either is mentioned.
 
     """
     made = []
-    nominal = comparison.joined(lambda i: comparison.predicted[name][i].mean)
+    predicted = comparison.predicted[name]
+    nominal = comparison.joined(lambda i: predicted[i].mean)
+
+    def join(parts: Sequence[NDArray]) -> NDArray:
+        return comparison.joined(lambda i: parts[i][..., None])[..., 0]
+
     for channel, output in enumerate(records.outputs.names):
         y = np.where(records.mask[..., channel], records.observed[..., channel], np.nan)
         y, x = y.astype(np.float64), nominal[..., channel]
@@ -158,7 +164,16 @@ def _of_twin(
         if np.corrcoef(x[both], y[both])[0, 1] < 0:
             continue
         delay, share = _dead_time(y, x)
-        if share >= explained and abs(delay) >= 0.5:
+        lag, lagging = _lag(y, [_filled(e.mean[..., channel]) for e in predicted], join)
+        # A lag that is missing leaves errors that are correlated; white ones it only smooths.
+        coloured = np.nan_to_num(autocorrelation(y - x).values).max(initial=0.0) > COLOURED
+        if coloured and lagging >= explained and lagging > share:
+            made.append(
+                f"A first-order lag of {lag / records.rate:.3g} s, as of a sensor or an actuator, "
+                f"explains {lagging:.0%} of the mean square error of the twin in {output}: give "
+                "the twin a further state that follows with it."
+            )
+        elif share >= explained and abs(delay) >= 0.5:
             seconds = delay / records.rate
             what, remedy = (
                 f"A dead time of {seconds:.3g} s",
@@ -194,6 +209,32 @@ def _dead_time(y: NDArray, x: NDArray) -> tuple[float, float]:
         delay += 0.5 * (before - after) / curvature if curvature > 0 else 0.0
     present = errors[longest]
     return delay, float(1 - errors[best] / present) if present > 0 else 0.0
+
+
+def _lag(
+    y: NDArray, parts: Sequence[NDArray], join: Callable[[Sequence[NDArray]], NDArray]
+) -> tuple[float, float]:
+    """The time constant in samples of a lag of simulations (r, T) that explains most of y (n, T).
+
+    The second number is the share of the mean square error that it explains. `join` gives (n, T) of
+    the parts.
+    """
+    best, present = (0.0, 0.0), float(np.nanmean((y - join(parts)) ** 2))
+    for lag in np.geomspace(0.5, max(1.0, LONGEST * y.shape[1]), 30).tolist():
+        kept = np.exp(-1 / lag)
+        moved = [
+            lfilter([1 - kept], [1, -kept], each, axis=1, zi=kept * each[:, :1])[0]
+            for each in parts
+        ]
+        share = 1 - float(np.nanmean((y - join(moved)) ** 2)) / present if present else 0.0
+        best = max(best, (lag, share), key=lambda pair: pair[1])
+    return best
+
+
+def _filled(x: NDArray) -> NDArray:
+    """Simulations (r, T), which before their first value stay at that."""
+    first = np.take_along_axis(x, np.isfinite(x).argmax(axis=1)[:, None], axis=1)
+    return np.where(np.isfinite(x), x, first)
 
 
 def without_twin(
