@@ -77,9 +77,12 @@ def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:
     assert row[-1].startswith("if it is a fault: leaking from 2.0 s")
     second = replace(within, name="weak pump", size=(-0.5, -0.6, -0.4), unit="", same=False)
     (row,) = _event_rows(watched, [found, second], 1.0)  # type: ignore[arg-type]
-    assert row[-1].endswith(
-        "; with more samples: weak pump from 3.1 s; size -0.5 (-0.6 to -0.4), probability 0.80"
-    )
+    newest = "weak pump from 3.1 s; size -0.5 (-0.6 to -0.4), probability 0.80"
+    assert row[-1].startswith(f"{newest}; before, by fewer samples: leaking from 2.0 s")
+    # What all samples say now is shown, also where it is not sure enough to replace the first.
+    unsure = replace(second, same=True)
+    (row,) = _event_rows(watched, [found, unsure], 1.0)  # type: ignore[arg-type]
+    assert row[-1].startswith(newest)
 
 
 @pytest.mark.slow

@@ -41,8 +41,7 @@ from retwin.cli.reading import (
     stored_name,
 )
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
-from retwin.data.quality.check import check_records
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
 
@@ -57,10 +56,14 @@ EQUATIONS = (
     "watched, and causes are its parameters too."
 )
 """What would watch the twin itself, where a black box takes its place."""
+REFITTED = (
+    "Fitted with --dynamics, your StateTwin itself is watched, and causes are its parameters too."
+)
+"""The same for a model of a `StateTwin` whose outputs are corrected."""
 FEW = 6
 """Faults that are listed, at most."""
-NEWER = "; with more samples: "
-"""What stands between a cause and the one after it."""
+EARLIER = "; before, by fewer samples: "
+"""What stands between a cause and the one that was named before it."""
 CONFIG = Path("monitor.toml")
 Reading = Callable[..., Trajectories]
 """`cli.reading.read` with the options of the command."""
@@ -95,7 +98,9 @@ def fit(
     records takes the place of a twin.
     """
     from retwin.monitor import fit_monitor, possible_causes, visible_sizes
-    from retwin.update import DynamicsTwin, load_twin
+    from retwin.update import load_twin
+    from retwin.update.agreement import check_with_twin
+    from retwin.update.dynamics.unknowns import state_names
 
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     model = files[0] if files[0].is_dir() and (files[0] / "model.json").is_file() else None
@@ -109,7 +114,7 @@ def fit(
         _fit_trajectories(model, healthy, out, false_alarms, case, reading, as_json)
         return
     updated = load_twin(model) if model else None
-    known = updated if isinstance(updated, DynamicsTwin) else None
+    known = _dynamics_of(updated)
     system = case_named(case or (updated.case if updated else None) or None)
     tables = all(each.suffix.lower() == ".csv" for each in healthy)
     if updated is None and system is None and mapping is None and tables:
@@ -122,7 +127,7 @@ def fit(
     with bar("calibrate") as show:
         show("monitor", 0.0)
         given = Trajectories.concatenate(records)
-        checked = check_records(given)
+        checked = check_with_twin(known, given)
         made = fit_monitor(
             known, given, false_alarms, lasting=3600.0 if lasting is None else lasting
         )
@@ -138,7 +143,8 @@ def fit(
     hours = given.mask.any(axis=2).sum() / twin.rate / 3600
     box = f"No twin: a black box, calibrated on {hours:.3g} h of your data; causes are channels."
     if updated:
-        box = f"{model} has no state equations to be followed sample by sample. {box} {EQUATIONS}"
+        box = f"{model} has no state equations to be followed sample by sample. {box} "
+        box += REFITTED if state_names(_inner(updated)) else EQUATIONS
     promises = {name: str(each) for name, each in made.promises.items()}
     tried = made.tried.text(twin.rate)
     about = {"arl": made.arl, "run_length": made.run_length, "warm_up": made.warm_up}
@@ -397,6 +403,22 @@ def recalibrate(
     answer(vars(version), text, as_json=as_json)
 
 
+def _inner(model: CorrectedTwin | DynamicsTwin | None) -> object:
+    """The twin whose outputs a model corrects, or the model."""
+    return getattr(getattr(model, "surrogate", None), "twin", model)
+
+
+def _dynamics_of(model: CorrectedTwin | DynamicsTwin | None) -> DynamicsTwin | None:
+    """What follows a machine sample by sample: a model with corrected state equations, or theirs.
+
+    A residual of outputs after them is no part of it.
+    """
+    from retwin.update import DynamicsTwin
+
+    inner = _inner(model)
+    return inner if isinstance(inner, DynamicsTwin) else None
+
+
 def _named(twin: CorrectedTwin | DynamicsTwin | None) -> TwinData | None:
     """What `read` takes for a case: the twin by whose channels the columns of a table are named."""
     from retwin.cases.twin_data import TwinData
@@ -435,12 +457,12 @@ def _causes(
 def _event_rows(
     watched: Watched, causes: Sequence[Cause], rate: float
 ) -> list[tuple[str, str, str, str, str]]:
-    """Events with begin and end, and causes as they became known.
+    """Events with begin and end, and causes, the newest first.
 
     Events of a record that follow one with the same cause are in the row of that: a fault that
     lasts may not show for a while.
     """
-    from retwin.monitor.models.cause import cause_text
+    from retwin.monitor.models.cause import PROBABLE, cause_text
     from retwin.report.labels import significant
 
     def text(cause: Cause) -> str:
@@ -464,10 +486,13 @@ def _event_rows(
                 named.append(cause)
             elif cause.name == named[-1].name and cause.onset[0] <= first.time:
                 named[-1] = cause  # the same from more samples
+            newest = cause
+        if named and newest.name not in [HEALTHY, *(each.name for each in named)]:
+            named += [newest] * (newest.probability * (1 - newest.unknown) > PROBABLE)
         end = ends.get((first.trajectory, first.event))
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
-        begin, texts = f"{first.time:.6g}", NEWER.join(map(text, named))
+        begin, texts = f"{first.time:.6g}", EARLIER.join(map(text, reversed(named)))
         if named and before in [(first.trajectory, each.name) for each in named]:
             further += 1
             times = f"{further} time{'s' * (further > 1)}"
@@ -483,10 +508,11 @@ def _event_rows(
 
 def _describe_event(record: str, begin: str, end: str, what: str, causes: str) -> str:
     """An event as lines: when and what, and each cause as it became known."""
-    until = ", which lasts" if end == "lasts" else f" to {end} s"
+    until = ", which lasts" if end == "lasts" else f" until it was over or hidden at {end} s"
     lines = [f"{record}, from {begin} s{until}: {what}"]
-    for first, *more in (each.split("; again, or still") for each in causes.split(NEWER)):
-        lines += [first, *(f"again, or still{each}" for each in more)]
+    for number, part in enumerate(causes.split(EARLIER)):
+        first, *more = part.split("; again, or still")
+        lines += [EARLIER[2:] * (number > 0) + first, *(f"again, or still{e}" for e in more)]
     return "\n    ".join(filter(None, lines))
 
 

@@ -17,7 +17,9 @@ from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
 from retwin.twins.twin import Twin
 from retwin.twins.wrappers.parametric import ParametricTwin
+from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.windows import simulated as simulated_outputs
+from retwin.update.forecasts import started_moments
 
 CLEAR = 0.5
 """Ratio of residuals from which exchanged commands are named."""
@@ -59,6 +61,8 @@ def simulated(twin: Twin, records: Trajectories) -> NDArray | None:
     try:
         if isinstance(twin, ParametricTwin):
             made = simulated_outputs(twin, records, records.mask, seed=0, own=True)
+        elif isinstance(twin, DynamicsTwin):
+            made = started_moments(twin, records, records.steps / records.rate)[0]
         else:
             made = twin.simulate(records.commands, seed=0).observed
     except (InputError, SimulationError):
