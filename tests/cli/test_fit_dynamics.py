@@ -258,7 +258,9 @@ def test_without_a_method_the_records_decide(folder: Path, tmp_path: Path, call)
     for file, seen in ((used, True), (other, False)):
         code, printed, err = call("evaluate", out, "--real", file, "--horizon", "5s")
         assert code == 0, err
-        assert ("The model was fitted to these records, where its errors" in " ".join(printed.split())) == seen
+        assert (
+            "The model was fitted to these records, where its errors" in " ".join(printed.split())
+        ) == seen
     bands = tmp_path / "bands.csv"
     code, _, err = call("generate", out, "--commands", other, "--bands", "--out", bands)
     assert code == 0, err

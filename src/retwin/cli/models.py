@@ -264,6 +264,8 @@ def _start_remarks(
 
 MUCH = 0.8
 """Ratio of errors from which starts of records are named."""
+HARDLY = 0.02
+"""Part of an error by which an update must lower it, not to be called one of bands alone."""
 CLEAR = 0.01
 """Part of an error by which another predictor must be better to be mentioned."""
 
@@ -281,6 +283,11 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
             own = next(s for s in scores if s.who == "model" and s.output == each.output)
             if each.rmse < (1 - CLEAR) * own.rmse:
                 made.append(f"{each.output}: {words[each.who]} is a better prediction, by RMSE.")
+            elif each.who == "twin" and own.rmse > (1 - HARDLY) * each.rmse and not each.horizon:
+                made.append(
+                    f"{each.output}: the RMSE is that of {words['twin']} within {HARDLY:.0%}: the "
+                    "update adds bands alone there."
+                )
         elif each.coverage < COVERAGE[0]:
             text = f"{each.output}: the 90 % band holds {each.coverage:.0%} of these samples"
             if each.interval is None or each.interval[1] >= LEVEL:

@@ -24,6 +24,7 @@ from retwin.report.identification.texts import (
 )
 from retwin.report.labels import behind, number, p_value, shown_unit, signed, significant
 from retwin.report.records import TITLE, records_part
+from retwin.update.dynamics.unknowns import state_names
 
 STRONG = 0.9
 """Correlation from which a cell is emphasised."""
@@ -72,6 +73,7 @@ def identification_page(
         start_values=start_values,
         command=command,
         folder=folder,
+        states=bool(state_names(found.twin)),
         findings=findings(found, values["notes"]),
         interval_remark=interval_remark(found),
         steps=next_steps(found),
