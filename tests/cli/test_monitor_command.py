@@ -104,7 +104,7 @@ def test_a_leak_is_reported_with_its_time_and_cause(watched: Path, call) -> None
         "This replay of 13.3 minutes shows 1 event. The promise of at most one false event in"
         in words
     )
-    assert "More events were seen than it allows: these are faults, or" in words
+    assert "These are more events than it allows: faults; or, if you know" in words
     assert "probability 1.00" in words
     assert first["cause"]["unit"] == "1/s"
 

@@ -249,7 +249,7 @@ def _plan(
 
     what = f"{counted(len(used), 'trajectory')} of {used.steps / used.rate:g} s"
     if held_out is not None:
-        what += f" ({len(held_out)} held out)"
+        what += f", and {len(held_out)} held out,"
     return f"{what} at {used.rate:g} Hz; {method} for {', '.join(opened.twin.names)}"
 
 

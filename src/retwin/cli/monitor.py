@@ -571,8 +571,8 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
             text += f" {kind}: {', '.join(names[:FEW])}{others}." if names else ""
     if events and poisson.sf(events - 1, samples / monitor.run_length) < monitor.alpha:
         text += (
-            " More events were seen than it allows: these are faults, or, if the machine was "
-            "healthy, the promise does not hold for it; only then calibrate with these records too."
+            " These are more events than it allows: faults; or, if you know that the machine was "
+            "healthy, the promise does not hold for it, so calibrate with these records too."
         )
     return text
 
