@@ -9,7 +9,7 @@ fault explains is `unknown`: process and measurement noise that are larger than 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -51,9 +51,9 @@ class StateDiagnosis:
     unknown : NDArray
         (n,), the probability that none of them is.
     evidence : NDArray
-        (n, C + 1), log marginal likelihood of the outputs for each class and for `unknown`; its
-        differences are divided by the long-run variance of the errors with the most probable class,
-        which is 1 unless the twin lacks something.
+        (n, C + 1), log marginal likelihood of the outputs for each class and for `unknown`.
+        Probabilities take its differences over the dispersion of the errors with the most probable
+        class, which is 1 unless the twin lacks something.
     size, onset, end : Estimate
         (n, C), size of each fault in the unit of what it changes, and its times in s; NaN where a
         class has none.
@@ -178,10 +178,11 @@ class StateInversionDiagnoser:
             "measured samples in each",
             remedy=remedy,
         )
-        found = []
+        found, dispersion = [], []
         single = [trajectories[i : i + 1] for i in range(len(trajectories))]
-        for row in in_threads(lambda each: self._integrals(each, known_start), single):
+        for row, nats in in_threads(lambda each: self._integrals(each, known_start), single):
             found.append(row)
+            dispersion.append(nats)
             if progress is not None:
                 progress(len(found) / len(trajectories))
         evidence = np.array([[each.evidence for each in row] for row in found])
@@ -194,8 +195,10 @@ class StateInversionDiagnoser:
             )
         parts = np.array([[(e.mean, e.low, e.high) for e in row[:-1]] for row in found])
         size, onset, end = (Estimate(*np.moveaxis(parts[..., k], 2, 0)) for k in range(3))
-        known = evidence[:, :-1]
-        share = np.exp(evidence - logsumexp(evidence, axis=1, keepdims=True))
+        top = evidence.max(axis=1, keepdims=True)
+        tempered = (evidence - top) / np.array(dispersion)[:, None]
+        known = tempered[:, :-1]
+        share = np.exp(tempered - logsumexp(tempered, axis=1, keepdims=True))
         return StateDiagnosis(
             self.classes,
             np.exp(known - logsumexp(known, axis=1, keepdims=True)),
@@ -209,8 +212,10 @@ class StateInversionDiagnoser:
 
     def _integrals(
         self, trajectory: Trajectories, known_start: bool, *, implausible: float = 1e6
-    ) -> list[Integral]:
+    ) -> tuple[list[Integral], float]:
         """Those of all faults for one trajectory, and of something else besides.
+
+        The second part is the dispersion of the errors that the most probable fault leaves.
 
         Parameters
         ----------
@@ -232,14 +237,10 @@ class StateInversionDiagnoser:
         row = [record.integral(fault) for fault in faults]
         unknown = record.unknown(faults, row)
         row = [record.tolerated(*each) for each in zip(faults, row, strict=True)]
-        row.append(Integral(unknown, *[NOTHING] * 4))
-        evidence = np.array([each.evidence for each in row])
-        leading = int(evidence[:-1].argmax())
-        if not np.isfinite(evidence[leading]):
-            return row
-        nats, top = record.dispersion(list(faults)[leading], row[leading].best), evidence.max()
-        evidence = top - (top - evidence) / nats
-        return [replace(e, evidence=own) for e, own in zip(row, evidence.tolist(), strict=True)]
+        leading = max(range(len(row)), key=lambda i: row[i].evidence)
+        known = np.isfinite(row[leading].evidence)
+        nats = record.dispersion(list(faults)[leading], row[leading].best) if known else 1.0
+        return [*row, Integral(unknown, *[NOTHING] * 4)], nats
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with the twin inside, or nothing."""
