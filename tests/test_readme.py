@@ -109,7 +109,7 @@ def test_the_first_path_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.M
         )
         assert done.returncode == 0, done.stderr
         printed = done.stdout
-    assert re.search(r"run6\.csv +run6 +6\d\d .*heater: another effect", printed), printed
+    assert re.search(r"run6\.csv, from 6\d\d s.*\n +heater: another effect", printed), printed
     assert len((tmp_path / "bands.csv").read_text().splitlines()) == 1201
 
 

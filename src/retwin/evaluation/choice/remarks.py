@@ -42,7 +42,7 @@ def remarks_of(
             f"The method was given ({by_name[chosen].title}); of those that were compared, "
             f"{by_name[preferred].title} would have been taken."
         )
-    made += _worse_than_mean(records, by_name[chosen])
+    made += _worse_than_mean(records, by_name[chosen], free=horizon is None)
     if len(records) < RECORDS:
         made.append(
             f"Only parts of {len(records)} record{'s' * (len(records) > 1)} were left out: the "
@@ -126,12 +126,14 @@ def correction_remarks(scores: Sequence[CandidateScore], chosen: str) -> list[st
     ]
 
 
-def _worse_than_mean(records: Trajectories, score: CandidateScore) -> list[str]:
+def _worse_than_mean(records: Trajectories, score: CandidateScore, *, free: bool) -> list[str]:
     values = np.where(records.mask, records.observed, np.nan).astype(np.float64)
     spread = dict(zip(records.outputs.names, np.nanstd(values, axis=(0, 1)), strict=True))
+    text = "; if the machine integrates, as a position does, judge predictions some time ahead: "
+    text = f"{text}--horizon 5s" if free else ""
     return [
         f"{name} is predicted worse than by its mean over the records: the error is {error:.3g}, "
-        f"the standard deviation {spread[name]:.3g}. Do not use this model for {name}."
+        f"the standard deviation {spread[name]:.3g}. Do not use this model for {name}{text}."
         for name, error in score.rmse.items()
         if error >= spread[name]
     ]
@@ -220,7 +222,8 @@ def _lag(
     the parts.
     """
     best, present = (0.0, 0.0), float(np.nanmean((y - join(parts)) ** 2))
-    for lag in np.geomspace(0.5, max(1.0, LONGEST * y.shape[1]), 30).tolist():
+    lags = np.geomspace(0.5, max(1.0, LONGEST * y.shape[1]), 30).tolist()
+    for lag in lags:
         kept = np.exp(-1 / lag)
         moved = [
             lfilter([1 - kept], [1, -kept], each, axis=1, zi=kept * each[:, :1])[0]
@@ -228,7 +231,7 @@ def _lag(
         ]
         share = 1 - float(np.nanmean((y - join(moved)) ** 2)) / present if present else 0.0
         best = max(best, (lag, share), key=lambda pair: pair[1])
-    return best
+    return best if best[0] < lags[-1] else (0.0, 0.0)  # smoothing, of a twin that is wrong
 
 
 def _filled(x: NDArray) -> NDArray:
