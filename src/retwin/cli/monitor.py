@@ -507,7 +507,7 @@ def _event_rows(
 
 
 def _describe_event(record: str, begin: str, end: str, what: str, causes: str) -> str:
-    """An event as lines: when and what, and each cause as it became known."""
+    """An event as lines: when and what, and its causes, the newest first."""
     until = ", which lasts" if end == "lasts" else f" until it was over or hidden at {end} s"
     lines = [f"{record}, from {begin} s{until}: {what}"]
     for number, part in enumerate(causes.split(EARLIER)):

@@ -178,11 +178,11 @@ class StateInversionDiagnoser:
             "measured samples in each",
             remedy=remedy,
         )
-        found, dispersion = [], []
+        found, dispersions = [], []
         single = [trajectories[i : i + 1] for i in range(len(trajectories))]
-        for row, nats in in_threads(lambda each: self._integrals(each, known_start), single):
+        for row, dispersion in in_threads(lambda each: self._integrals(each, known_start), single):
             found.append(row)
-            dispersion.append(nats)
+            dispersions.append(dispersion)
             if progress is not None:
                 progress(len(found) / len(trajectories))
         evidence = np.array([[each.evidence for each in row] for row in found])
@@ -196,7 +196,7 @@ class StateInversionDiagnoser:
         parts = np.array([[(e.mean, e.low, e.high) for e in row[:-1]] for row in found])
         size, onset, end = (Estimate(*np.moveaxis(parts[..., k], 2, 0)) for k in range(3))
         top = evidence.max(axis=1, keepdims=True)
-        tempered = (evidence - top) / np.array(dispersion)[:, None]
+        tempered = (evidence - top) / np.array(dispersions)[:, None]
         known = tempered[:, :-1]
         share = np.exp(tempered - logsumexp(tempered, axis=1, keepdims=True))
         return StateDiagnosis(
@@ -239,8 +239,9 @@ class StateInversionDiagnoser:
         row = [record.tolerated(*each) for each in zip(faults, row, strict=True)]
         leading = max(range(len(row)), key=lambda i: row[i].evidence)
         known = np.isfinite(row[leading].evidence)
-        nats = record.dispersion(list(faults)[leading], row[leading].best) if known else 1.0
-        return [*row, Integral(unknown, *[NOTHING] * 4)], nats
+        point = list(faults)[leading], row[leading].best
+        dispersion = record.dispersion(*point) if known else 1.0
+        return [*row, Integral(unknown, *[NOTHING] * 4)], dispersion
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with the twin inside, or nothing."""
