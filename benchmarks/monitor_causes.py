@@ -6,7 +6,9 @@ FOLDER has the four records of the incubator. The monitor is calibrated on the t
 faults are put into 2020-12-22: those of the sensor into its readings, a lid and a heater as what
 they change in a simulation, added to the readings; in a second row another fault begins while the
 first one lasts. Counted are the first causes of events that are not the fault, and the further ones
-that are named: rightly, where they are the second fault, and wrongly.
+that are named: rightly, where they are the second fault, and wrongly. Of the first and of the last
+cause of an event the probability of the fault is scored by its logarithm (log loss), and a cause is
+sure and wrong that is not the fault and has more than 0.9.
 """
 
 from __future__ import annotations
@@ -26,12 +28,15 @@ from retwin.cases.styrofoam_incubator.case import incubator, measurements
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
 from retwin.data.trajectories import HEALTHY
 from retwin.monitor import find_causes, fit_monitor, possible_causes
+from retwin.monitor.models.cause import PROBABLE
 from retwin.update import OutsideTrainingWarning, fit_dynamics
 
 LENGTHS = (60.0, 120.0, 400.0)
 SIZES = {"lid": (5.0, 15.0), "heater": (-1.0, -0.4), "sensor bias": (1.5, 6.0)}
 SIZES["sensor drift"] = (0.02, 0.08)
 COUNTED = "events", "missed", "first wrong", "further right", "further wrong"
+LOWEST, SURE = 1e-4, 0.9
+"""Least probability that counts in a log loss, and that of a cause which is sure."""
 AFTER = 60.0
 """Seconds after the end of a fault in which its event may begin."""
 
@@ -70,6 +75,7 @@ def main() -> None:
     def count(second: bool) -> dict[str, float]:
         """What the events of injected faults are called."""
         rng, counts = np.random.default_rng(0), dict.fromkeys(COUNTED, 0.0)
+        scored: dict[str, list[tuple[float, bool]]] = {"first": [], "last": []}
         for name in names:
             for number in range(repeats):
                 onset = rng.uniform(0.3, 0.7) * day.steps / day.rate
@@ -91,10 +97,18 @@ def main() -> None:
                 first, *further = [each for each in known if each.alarm.event == event[0].event]
                 counts["events"] += 1
                 counts["first wrong"] += first.name != name
+                for which, cause in (("first", first), ("last", [first, *further][-1])):
+                    loss = -np.log(max(cause.probabilities[name], LOWEST))
+                    sure = cause.probability > SURE and cause.unknown < PROBABLE
+                    scored[which].append((loss, sure and cause.name != name))
                 for cause in further:
                     if not cause.same:
                         wrong = cause.name not in faults[1:]
                         counts["further wrong" if wrong else "further right"] += 1
+        for which, each in scored.items():
+            loss, wrong = zip(*each, strict=True)
+            counts |= {f"{which}: log loss": float(np.mean(loss))}
+            counts |= {f"{which}: sure and wrong": float(np.sum(wrong))}
         return counts
 
     rows = {"one fault": count(second=False), "two faults": count(second=True)}
