@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.special import softmax
 from test_readme import python_of
 
 import retwin as rt
@@ -288,6 +289,10 @@ def test_sizes_are_in_their_intervals_where_errors_depend_on_each_other(
             wider.append((high - low) / before)
     assert np.mean(inside) >= 0.75
     assert np.median(wider) < 8
+    # Samples that are not each new say less of which fault it is than their evidence.
+    raw = softmax(found.evidence[:, :-1], axis=1).max(axis=1)
+    assert (found.probabilities.max(axis=1) <= raw + 1e-9).all()
+    assert np.median(raw - found.probabilities.max(axis=1)) > 1e-3
 
 
 @pytest.mark.parametrize("frozen", [True, False])
