@@ -13,10 +13,10 @@ from scipy.signal import lfilter
 
 import retwin as rt
 from retwin.cli.monitor import _event_rows
-from retwin.monitor import Alarm
+from retwin.monitor import Alarm, Monitor
 from retwin.monitor.models.cause import Cause, cause_text
 from retwin.twins import ParameterShift
-from retwin.update import DynamicsTwin
+from retwin.update import DynamicsTwin, StationaryNoise
 
 
 @pytest.mark.slow
@@ -204,11 +204,26 @@ def test_a_model_without_state_equations_is_watched_by_a_black_box(
     code, printed, err = call("monitor", "fit", tmp_path / "model", healthy, "--out", out)
     assert code == 0, err
     words = " ".join(printed.split())
-    assert "model has no state equations" in words
+    assert "model corrects no state equations" in words
     assert "causes are channels" in words
+    assert "and fit --dynamics, the twin itself is watched" in words
     code, printed, err = call("monitor", "replay", out, watched / "leak.npz")
     assert code == 0, err
     assert "1 event" in printed
+
+
+@pytest.mark.slow
+def test_state_equations_are_watched_beneath_a_correction_of_outputs(
+    watched: Path, call, tmp_path: Path
+) -> None:
+    inner, healthy = DynamicsTwin.load(watched / "model"), rt.load(watched / "healthy.npz")
+    residual = rt.fit_residual(inner, healthy, rt.Additive(), StationaryNoise(), seed=0)
+    rt.CorrectedTwin(inner, residual).save(tmp_path / "model")
+    given = (tmp_path / "model", watched / "healthy.npz", "--out", tmp_path / "watch")
+    code, printed, err = call("monitor", "fit", *given)
+    assert code == 0, err
+    assert "black box" not in printed
+    assert Monitor.load(tmp_path / "watch").twin.equations.names == inner.equations.names
 
 
 def test_a_folder_that_is_no_store_is_not_made_one(call, tmp_path: Path) -> None:

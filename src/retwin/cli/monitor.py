@@ -52,14 +52,10 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.update import CorrectedTwin, DynamicsTwin
 
 EQUATIONS = (
-    "Written as a StateTwin (docs/twins.md#states) and fitted with --dynamics, the twin itself is "
-    "watched, and causes are its parameters too."
+    "With state equations (a StateTwin, docs/twins.md#states) and fit --dynamics, the twin itself "
+    "is watched, and causes are its parameters too."
 )
 """What would watch the twin itself, where a black box takes its place."""
-REFITTED = (
-    "Fitted with --dynamics, your StateTwin itself is watched, and causes are its parameters too."
-)
-"""The same for a model of a `StateTwin` whose outputs are corrected."""
 FEW = 6
 """Faults that are listed, at most."""
 EARLIER = "; before, by fewer samples: "
@@ -100,7 +96,6 @@ def fit(
     from retwin.monitor import fit_monitor, possible_causes, visible_sizes
     from retwin.update import load_twin
     from retwin.update.agreement import check_with_twin
-    from retwin.update.dynamics.unknowns import state_names
 
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     model = files[0] if files[0].is_dir() and (files[0] / "model.json").is_file() else None
@@ -143,8 +138,7 @@ def fit(
     hours = given.mask.any(axis=2).sum() / twin.rate / 3600
     box = f"No twin: a black box, calibrated on {hours:.3g} h of your data; causes are channels."
     if updated:
-        box = f"{model} has no state equations to be followed sample by sample. {box} "
-        box += REFITTED if state_names(_inner(updated)) else EQUATIONS
+        box = f"{model} corrects no state equations, which alone are followed. {box} {EQUATIONS}"
     promises = {name: str(each) for name, each in made.promises.items()}
     tried = made.tried.text(twin.rate)
     about = {"arl": made.arl, "run_length": made.run_length, "warm_up": made.warm_up}
@@ -403,11 +397,6 @@ def recalibrate(
     answer(vars(version), text, as_json=as_json)
 
 
-def _inner(model: CorrectedTwin | DynamicsTwin | None) -> object:
-    """The twin whose outputs a model corrects, or the model."""
-    return getattr(getattr(model, "surrogate", None), "twin", model)
-
-
 def _dynamics_of(model: CorrectedTwin | DynamicsTwin | None) -> DynamicsTwin | None:
     """What follows a machine sample by sample: a model with corrected state equations, or theirs.
 
@@ -415,7 +404,7 @@ def _dynamics_of(model: CorrectedTwin | DynamicsTwin | None) -> DynamicsTwin | N
     """
     from retwin.update import DynamicsTwin
 
-    inner = _inner(model)
+    inner = getattr(getattr(model, "surrogate", None), "twin", model)
     return inner if isinstance(inner, DynamicsTwin) else None
 
 
