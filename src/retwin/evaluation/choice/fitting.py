@@ -279,7 +279,7 @@ def _names(candidates: Candidates, settings: Choice) -> list[str]:
     if not settings.method or settings.candidates:
         return names
     simpler = names[: names.index(settings.method)]
-    per_segment = {"delay_offset", "segments"} - {settings.method}  # dear, and no part of others
+    per_segment = {"delay_offset", "segments"} - {settings.method}  # costly, and no part of others
     return [*(each for each in simpler if each not in per_segment), settings.method]
 
 

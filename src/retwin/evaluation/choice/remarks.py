@@ -166,7 +166,7 @@ def _of_twin(
         if np.corrcoef(x[both], y[both])[0, 1] < 0:
             continue
         delay, share = _dead_time(y, x)
-        lag, lagging = _lag(y, [_filled(e.mean[..., channel]) for e in predicted], join)
+        lag, lagging = _lag(y, [_fill_begin(e.mean[..., channel]) for e in predicted], join)
         # A lag that is missing leaves errors that are correlated; white ones it only smooths.
         coloured = np.nan_to_num(autocorrelation(y - x).values).max(initial=0.0) > COLOURED
         if coloured and lagging >= explained and lagging > share:
@@ -234,7 +234,7 @@ def _lag(
     return best if best[0] < lags[-1] else (0.0, 0.0)  # smoothing, of a twin that is wrong
 
 
-def _filled(x: NDArray) -> NDArray:
+def _fill_begin(x: NDArray) -> NDArray:
     """Simulations (r, T), which before their first value stay at that."""
     first = np.take_along_axis(x, np.isfinite(x).argmax(axis=1)[:, None], axis=1)
     return np.where(np.isfinite(x), x, first)
