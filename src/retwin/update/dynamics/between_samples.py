@@ -91,10 +91,10 @@ def chosen(
             own, at = without_discrepancy(replace(base, interpolation=other), observed, unknowns)
         except InputError:  # its simulation is not finite
             continue
-        given = (settings, visited, parts, far, lambda done: None)
-        found = best_of(searched(own, at.point, *given))
-        if better(found, best[2]):
-            best = (own, at, found)
+        given = (own, at.point, settings, visited, parts, far, lambda done: None)
+        # The best form first: where that gains nothing, the others are not tried.
+        if better(best_of(searched(*given, only=best[2])), best[2]):
+            best = (own, at, best_of(searched(*given)))
     return best
 
 

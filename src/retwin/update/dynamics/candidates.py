@@ -142,6 +142,8 @@ def searched(
     parts: Sequence[NDArray],
     far: Sequence[NDArray],
     progress: Progress,
+    *,
+    only: Candidate | None = None,
 ) -> list[Candidate]:
     """All candidates, the simplest first.
 
@@ -159,10 +161,14 @@ def searched(
         Parts (n, T) of the samples that are held out in turn, in time and at the edges.
     progress : callable
         Called with the share of the work that is done.
+    only : Candidate, optional
+        The one whose form alone is tried, with and without a memory.
 
     """
     tried: list[Candidate] = []
     for number, equations in enumerate(_forms(alone, point, settings, visited)):
+        if only is not None and not equations.alike(only.equations):
+            continue
         own, found = _follow(equations, None, alone, point, STRONGEST)
         tried.append(Candidate.tested(equations, None, own, found, parts, far))
         if settings.remembers(equations.form):
@@ -177,10 +183,11 @@ def searched(
 def best_of(tried: Sequence[Candidate]) -> Candidate:
     """The simplest candidate whose held-out errors are those of the best one, up to chance."""
     best = tried[_simplest([each.squares for each in tried])]
-    more = best.memory is not None or best.opened
     without = [each for each in tried if each.memory is None and not each.opened]
+    if not without or best in without:
+        return best
     other = without[_simplest([each.squares for each in without])]
-    return other if more and not better(best, other) else best
+    return best if better(best, other) else other
 
 
 def better(candidate: Candidate, other: Candidate) -> bool:

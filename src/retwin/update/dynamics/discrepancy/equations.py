@@ -168,6 +168,10 @@ class CorrectedEquations:
             first += len(terms)
         return replace(whole, dropped=frozenset(dropped))
 
+    def alike(self, other: CorrectedEquations) -> bool:
+        """Whether the discrepancy of other equations has the same form."""
+        return (self.form, self.opened) == (other.form, other.opened)
+
     def visiting(self, states: NDArray, commands: NDArray) -> CorrectedEquations:
         """The same with other states (n, T, d_x) and commands (n, T, d_u) that are visited."""
         return replace(self, visited=_some(states, commands))
