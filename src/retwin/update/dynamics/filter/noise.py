@@ -105,14 +105,20 @@ def _predict(
 
 
 def folds(seen: NDArray, count: int) -> list[NDArray]:
-    """Parts (n, T) of the record: each trajectory is cut into `count` blocks of samples.
+    """Parts (n, T) of the record: whole trajectories, or else blocks of samples of each.
 
-    A fold has one block of each trajectory, another one in each, so that it holds all phases of a
-    record without holding out the start of all trajectories.
+    Where there are half as many trajectories as parts, each part is of whole ones: what differs
+    between them, such as the weather of a day, would else be learned from the samples beside those
+    that are left out. Otherwise a fold has one block of each trajectory, another one in each, so
+    that it holds all phases of a record without holding out the start of all trajectories.
     """
     trajectories, samples, _ = seen.shape
-    block = np.arange(samples) * count // samples
-    own = (block + np.arange(trajectories)[:, None]) % count
+    place = np.arange(trajectories)[:, None]
+    if 2 * trajectories >= count:
+        count = min(count, trajectories)
+        own = np.broadcast_to(place % count, seen.shape[:2])
+    else:
+        own = (np.arange(samples) * count // samples + place) % count
     return [own == fold for fold in range(count)]
 
 
