@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import retwin as rt
+from retwin.cases.styrofoam_incubator.case import WARM_UP, measurements
+from retwin.cases.styrofoam_incubator.twin import INCUBATOR
 from retwin.evaluation import hold_out, validate_identification
 from retwin.report.identification.texts import findings
 from retwin.twins import FunctionTwin, Parameter, ParametricTwin, State, StateTwin
@@ -128,6 +132,37 @@ def test_a_stable_plant_is_simulated_freely() -> None:
     found = identify(LAG.parametric(), record(commands, made), QUICK, seed=0)
     assert (found.horizon, found.horizons, found.lasting) == (np.inf, (), False)
     assert found.values["gain"] == pytest.approx(GAIN, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.real_data
+@pytest.mark.filterwarnings("ignore:not identified|at a bound|unknown")
+def test_windows_are_taken_where_whole_records_are_overfitted() -> None:
+    """A day of the incubator, whose parts are predicted badly by parameters of whole records.
+
+    The plant is stable: effects of its start decay. The next day says which parameters are better.
+    """
+    folder = Path(os.environ.get("RETWIN_DATA", "")) / "incubator"
+    if not folder.is_dir():
+        pytest.skip("RETWIN_DATA names no folder with incubator/*.csv")
+    _, others = measurements(warm_up=0)(folder)
+    first, following = (
+        others[[i]].between(0, float(others.lengths[i]) / others.rate) for i in (0, 1)
+    )
+    guess = {"c_air": 500.0, "g_box": 0.5, "c_heater": 50.0, "g_heater": 1.0}
+    twin, errors = INCUBATOR.parametric().with_values(guess), {}
+    for horizon in (None, np.inf):
+        found = identify(twin, first, seed=0, horizon=horizon)
+        physics = found.twin.holding(*(each.name for each in INCUBATOR.parameters))
+        started = identify(physics, following.between(0, WARM_UP), seed=0).twin
+        error = started.simulate(following.commands, seed=0).observed - following.observed
+        errors[horizon] = np.sqrt(np.mean(error[following.mask] ** 2))
+        if horizon is None:
+            assert np.isfinite(found.horizon)
+            assert not found.lasting
+            judged = validate_identification(found, twin, first)
+            assert "have not seen more than twice as badly" in " ".join(findings(judged))
+    assert errors[None] < 0.7 * errors[np.inf]
 
 
 def test_what_windows_would_need_is_said_of_a_function(cart: rt.Trajectories) -> None:

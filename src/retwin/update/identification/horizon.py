@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ SHORTEST = 20
 LASTING = 0.5
 """Effect of a start or an early command on the outputs at the end of a record, over its largest
 effect, from which a plant counts as integrating or unstable. That of a stable plant decays."""
+OVERFITTED = 2.0
+"""Ratio of the errors of parts of a record that were left out to those of the fit, from which on
+the parameters of whole records are no good ones."""
 
 Fit = Callable[[Trajectories, int | None], ParametricTwin]
 """Fits a twin to measurements, in windows of so many samples or None for whole records."""
@@ -90,17 +94,11 @@ def lengths_of(observed: Trajectories) -> list[int]:
     return made
 
 
-def choose_length(observed: Trajectories, fit: Fit, stride: int, *, whole: bool) -> list[Candidate]:
-    """The candidates, the chosen one first.
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Parts of a record that are left out in turn, and errors of predictions of them.
 
-    Each is fitted without a part of the record in turn, and predicts windows of that part from
-    their first halves, and the part as a whole from the samples before it. It is chosen whose
-    errors are the smallest in the geometric mean over the same horizons for all; whole records are
-    preferred to windows within one standard error.
-    Horizons over which nothing predicts better than the mean of the record do not count: there
-    the disturbances decide, and under feedback the commands reveal these.
-
-    Parameters
+    Attributes
     ----------
     observed : Trajectories
         The record.
@@ -108,35 +106,101 @@ def choose_length(observed: Trajectories, fit: Fit, stride: int, *, whole: bool)
         See `Fit`.
     stride : int
         Every how many samples the sensor measures.
-    whole : bool
-        Whether whole records are a candidate.
 
     """
-    horizons = lengths_of(observed)
-    lengths: list[int | None] = [*([None] if whole else []), *horizons]
-    if len(lengths) < 2 or not horizons:
-        return [Candidate(each, 1.0, 0.0) for each in lengths[:1]]
-    spread = spread_of(observed)
-    spread = np.where(spread > 0, spread, 1.0)
-    spread[~observed.mask.any(axis=(0, 1))] = np.nan
-    logs = np.full((len(lengths), FOLDS, 1 + len(horizons)), np.nan)
-    scale, warm = (stride, spread), horizons[0]
-    for k, part in enumerate(_parts(observed)):
-        rest = observed.replace(mask=observed.mask & ~part[..., None])
-        left = observed.replace(mask=observed.mask & part[..., None])
-        before = part | np.pad(part[:, warm:], ((0, 0), (0, warm)))
-        longer = observed.replace(mask=observed.mask & before[..., None])
-        seen = longer.mask.any(axis=2).sum(axis=1)
-        longest = int(seen[seen > 0].min(initial=observed.steps)) - warm
-        for i, length in enumerate(lengths):
+
+    observed: Trajectories
+    fit: Fit
+    stride: int
+
+    @cached_property
+    def parts(self) -> list[NDArray]:
+        """(n, T) each."""
+        return list(_parts(self.observed))
+
+    @cached_property
+    def spread(self) -> NDArray:
+        """Standard deviations (d_y,) of the outputs; NaN of those that were never measured."""
+        spread = spread_of(self.observed)
+        spread = np.where(spread > 0, spread, 1.0)
+        spread[~self.observed.mask.any(axis=(0, 1))] = np.nan
+        return spread
+
+    def fitted(self, length: int | None) -> list[ParametricTwin | None]:
+        """The twins without each part, from windows of a length; None where a simulation fails."""
+        made: list[ParametricTwin | None] = []
+        for part in self.parts:
+            rest = self.observed.replace(mask=self.observed.mask & ~part[..., None])
             try:
-                twin = fit(rest, length)
-            except InputError:  # a simulation of the whole record fails
+                made.append(self.fit(rest, length))
+            except InputError:
+                made.append(None)
+        return made
+
+    def errors(self, twins: Sequence[ParametricTwin | None], horizons: Sequence[int]) -> NDArray:
+        """Logarithms (K, 1 + h) of errors of each part as a whole, and over some horizons.
+
+        A part is predicted as a whole from the samples before it, over a horizon from the first
+        halves of windows.
+        """
+        observed, scale = self.observed, (self.stride, self.spread)
+        warm, logs = lengths_of(observed)[0], np.full((len(twins), 1 + len(horizons)), np.nan)
+        for k, (part, twin) in enumerate(zip(self.parts, twins, strict=True)):
+            if twin is None:
                 continue
-            logs[i, k] = [
+            left = observed.replace(mask=observed.mask & part[..., None])
+            before = part | np.pad(part[:, warm:], ((0, 0), (0, warm)))
+            longer = observed.replace(mask=observed.mask & before[..., None])
+            seen = longer.mask.any(axis=2).sum(axis=1)
+            longest = int(seen[seen > 0].min(initial=observed.steps)) - warm
+            logs[k] = [
                 _error(twin, longer, longest, scale, warm=warm),
                 *(_error(twin, left, each, scale) for each in horizons),
             ]
+        return logs
+
+
+def overfitted(held: HeldOut, residual: NDArray, without: Sequence[ParametricTwin | None]) -> bool:
+    """Whether parameters fitted to whole records predict far worse what they have not seen.
+
+    Compared are the errors of twins fitted `without` each part, which predict it from the samples
+    before it, with the `residual` (n, P, d_y) of the fit to all. Then parameters and starts
+    describe disturbances and what the twin lacks, which windows leave to their starts.
+    """
+    seen = held.observed.mask[:, :: held.stride]
+    fitted = np.array(
+        [
+            _log_rms(residual, seen & part[:, :: held.stride, None], held.spread)
+            for part in held.parts
+        ]
+    )
+    alone, inside = np.exp(2 * held.errors(without, ())[:, 0]), np.exp(2 * fitted)
+    known = np.isfinite(alone) & np.isfinite(inside)
+    return bool(alone[known].sum() > OVERFITTED**2 * inside[known].sum())
+
+
+def choose_length(held: HeldOut, whole: Sequence[ParametricTwin | None] | None) -> list[Candidate]:
+    """The candidates, the chosen one first.
+
+    Each is fitted without a part of the record in turn, and predicts that part. It is chosen whose
+    errors are the smallest in the geometric mean over the same horizons for all.
+    Horizons over which nothing predicts better than the mean of the record do not count: there
+    the disturbances decide, and under feedback the commands reveal these.
+
+    Parameters
+    ----------
+    held : HeldOut
+        The parts.
+    whole : sequence of ParametricTwin or None, optional
+        The twins that were fitted to whole records without each part, where these are a candidate.
+
+    """
+    horizons = lengths_of(held.observed)
+    lengths: list[int | None] = [*([] if whole is None else [None]), *horizons]
+    if len(lengths) < 2:
+        return [Candidate(each, 1.0, 0.0) for each in lengths]
+    fits = [whole if each is None else held.fitted(each) for each in lengths]
+    logs = np.stack([held.errors(each or (), horizons) for each in fits])
     best = np.where(np.isfinite(logs), logs, np.inf).min(axis=0)
     known = np.isfinite(best)
     useful = np.where(known, best, 0.0).sum(axis=0) < 0
@@ -158,9 +222,6 @@ def _rank(lengths: Sequence[int | None], logs: NDArray) -> list[Candidate]:
         spread = float(difference.std(ddof=1)) if finite and len(difference) > 1 else 0.0
         made.append(Candidate(length, error, spread / np.sqrt(len(difference))))
     order = sorted(range(len(made)), key=lambda i: made[i].error)
-    first = made[0]
-    if first.length is None and np.log(first.error) <= first.deviation:
-        order.sort(key=lambda i: i != 0)
     return [made[i] for i in order]
 
 
@@ -186,14 +247,18 @@ def _error(
     *,
     warm: int | None = None,
 ) -> float:
-    """Logarithm of the RMS error over a horizon, in standard deviations of the outputs.
+    """The logarithm of the RMS error of predictions over a horizon; see `_log_rms`."""
+    stride, spread = scale
+    return _log_rms(*predictions(twin, left, horizon, stride, warm=warm), spread)
+
+
+def _log_rms(error: NDArray, seen: NDArray, spread: NDArray) -> float:
+    """Logarithm of the RMS error of samples that are seen, in standard deviations of the outputs.
 
     These are NaN of outputs that were never measured, which do not count. The error is NaN where
     another one is not measured.
     """
-    stride, spread = scale
     known = np.isfinite(spread)
-    error, seen = predictions(twin, left, horizon, stride, warm=warm)
     count = seen.sum(axis=(0, 1))
     if not count[known].all():
         return float("nan")

@@ -23,7 +23,14 @@ from retwin.progress import Progress
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.windows import state_based
 from retwin.update.identification.bayes import infer_posterior
-from retwin.update.identification.horizon import Candidate, choose_length, lasting
+from retwin.update.identification.horizon import (
+    Candidate,
+    HeldOut,
+    choose_length,
+    lasting,
+    lengths_of,
+    overfitted,
+)
 from retwin.update.identification.identifiability import (
     CHI2_95,
     MIN_TRAJECTORIES,
@@ -250,22 +257,30 @@ def _search(
         try:
             with begin(twin, observed) as misfit:
                 found, stride = _fit(misfit, method, missing, progress), misfit.stride
+                best = np.array([found.starts[0].values])
+                residual = misfit.residuals(best)[0] * misfit.unit
         except InputError:
             usable = isinstance(observed, Trajectories)
             if not (choice and usable and lasting(twin, observed)):
                 raise
             stride = 1
-        if found is not None:
-            found = replace(found, lasting=lasting(found.twin, observed))
-            if not (choice and found.lasting):
-                return found
 
         def fit(part: Trajectories, windows: int | None) -> ParametricTwin:
             own = twin if windows or found is None else found.twin
             with begin(own, part, length=windows) as misfit:
                 return _fit(misfit, LeastSquares(1, method.loss), "", None).twin
 
-        candidates = choose_length(observed, fit, stride, whole=found is not None)
+        held, whole = HeldOut(observed, fit, stride), None
+        if found is not None:
+            lasts = lasting(found.twin, observed)
+            found = replace(found, lasting=lasts)
+            if not choice or not lengths_of(observed):
+                return found
+            whole = held.fitted(None)
+            if not (lasts or overfitted(held, residual, whole)):
+                return found
+
+        candidates = choose_length(held, whole)
         length = candidates[0].length if candidates else None
         if length is None:
             expected = "records of 200 samples or more, for a twin that cannot simulate them"
@@ -275,7 +290,8 @@ def _search(
             return replace(found, horizons=tuple(candidates))
     with begin(twin, observed, length=length) as misfit:
         again = _fit(misfit, method, missing, progress)
-    return replace(again, horizon=length / observed.rate, horizons=tuple(candidates), lasting=True)
+    lasts = found.lasting if found is not None else lasting(again.twin, observed)
+    return replace(again, horizon=length / observed.rate, horizons=tuple(candidates), lasting=lasts)
 
 
 def _samples_of(horizon: float | None, twin: ParametricTwin, observed: Trajectories) -> int | None:
