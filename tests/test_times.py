@@ -9,6 +9,7 @@ import pytest
 
 import retwin as rt
 from retwin.arrays import interpolated
+from retwin.cli.options import seconds_of
 from retwin.times import sample_rate, stride_of, to_samples
 from retwin.twins.time_step import steps_per_sample
 
@@ -78,3 +79,25 @@ def test_values_between_samples_are_those_of_numpy(stride: int) -> None:
     alone = interpolated(values, at[1], stride)
     np.testing.assert_allclose(alone[1], np.moveaxis(wanted, 1, 2)[1])
     np.testing.assert_array_equal(interpolated(values[:, :1], at, stride)[:, 0], values[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [
+        ("free", None),
+        ("0.5", 0.5),
+        ("90 s", 90.0),
+        ("15min", 900.0),
+        ("2h", 7200.0),
+        ("1e-1s", 0.1),
+    ],
+)
+def test_a_time_of_an_option_has_a_unit(text: str, seconds: float | None) -> None:
+    assert seconds_of("--warm-up", text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1s", "2 weeks", "inf", "nan", "1e999h"])
+def test_what_is_no_time_is_shown_as_it_was_written(text: str) -> None:
+    with pytest.raises(rt.InputError, match="90s, 15min, 2h or 1d") as raised:
+        seconds_of("--warm-up", text)
+    assert raised.value.got == text

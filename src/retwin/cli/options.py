@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from retwin.catalog import CASES
-from retwin.checks import positive, require, whole
+from retwin.checks import require, whole
 from retwin.cli.completion import one_of
 
 
@@ -96,19 +98,27 @@ def leave_out(options: Mapping[str, object], when: str) -> None:
         require(absent, name, expected=f"none {when}", got=value, remedy="leave it out")
 
 
+SECONDS = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+"""By unit of a time."""
+
+
 def seconds_of(option: str, text: str) -> float | None:
-    """The time in s of a text such as `0.5` or `1s`; None for `free`.
+    """The time in s of a text such as `0.5`, `1s`, `15min` or `2h`; None for `free`.
 
     Raises InputError for another text.
     """
     if text == "free":
         return None
-    number = text.removesuffix("s").strip()
-    try:
-        value = float(number)
-    except ValueError:
-        value = 0.0
-    return positive(option, value, remedy="write free, or a time in seconds such as 1s")
+    found = re.fullmatch(r"\s*((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-z]*)\s*", text)
+    value = float(found[1]) * SECONDS.get(found[2], 0.0) if found else 0.0
+    require(
+        0 < value < inf,
+        option,
+        expected="free, or a time above 0 such as 90s, 15min, 2h or 1d",
+        got=text,
+        remedy="a number alone is in seconds",
+    )
+    return value
 
 
 def channel_names(text: str) -> tuple[str, ...]:
