@@ -327,6 +327,14 @@ def test_no_band_is_given_where_commands_leave_the_range_of_the_calibration() ->
     assert np.isfinite([row.crps, row.coverage, row.width]).all()
 
 
+def test_another_unit_is_named_with_its_range() -> None:
+    found = rt.fit(twin_of(), records(0, slope=right), rt.Choice(candidates=("parameters",)))
+    other = records(1, slope=right)
+    kelvin = other.replace(observed=other.observed + 273.15)
+    with pytest.warns(rt.update.OutsideTrainingWarning, match="is 2.* here, .* another unit"):
+        predict_records(found.twin, kelvin)
+
+
 @pytest.mark.parametrize("drift", [0.0, 2.0])
 def test_bands_of_longer_records_are_given_where_errors_do_not_drift(drift: float) -> None:
     data = records(0, slope=right)
@@ -566,6 +574,19 @@ def test_a_band_that_holds_too_little_is_said_with_how_sure_that_is(
     found = _verdict([model, ModelScore("mean", "y", None, 2.0, 2.0, *2 * [float("nan")])])
     assert len(found) == bool(text)
     assert text in " ".join(found)
+
+
+def test_an_output_that_has_nothing_in_common_with_the_model_is_named_as_such_alone() -> None:
+    nan = float("nan")
+    scores = [
+        ModelScore("model", "y", None, 26.0, 25.0, 0.0, 4.0),
+        ModelScore("twin", "y", None, 25.0, 25.0, nan, nan),
+        ModelScore("mean", "y", None, 6.0, 5.0, nan, nan),
+    ]
+    (found,) = _verdict(scores)
+    assert "another unit, another column, or another machine" in found
+    held = replace(scores[0], coverage=0.9)
+    assert not any("another unit" in each for each in _verdict([held, *scores[1:]]))
 
 
 def test_the_coverage_of_five_records_has_an_interval_that_contains_it() -> None:

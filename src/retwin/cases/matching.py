@@ -12,7 +12,9 @@ from retwin.checks import require
 from retwin.data.logs.units import converted
 from retwin.data.trajectories import HEALTHY, Channels, Trajectories
 from retwin.errors import InputError
+from retwin.twins.collected import SimulationError
 from retwin.twins.twin import Twin
+from retwin.update.forecast_errors import value_range
 
 CONSTANT = "constant in what was read, which therefore shows no dynamics of it."
 """What is noted of channels that never change."""
@@ -82,9 +84,20 @@ def match_twin(
     observed = _columns(found.observed, found.outputs, outputs, twin.outputs, name, notes)
     none = np.zeros(found.mask.shape[:2], dtype=bool)
     mask = np.stack([none if at is None else found.mask[..., at] for at in outputs], axis=-1)
+    try:
+        nominal = twin.simulate(commands, seed=0).nominal
+    except SimulationError as error:
+        ends = zip(twin.inputs.names, *value_range(commands), strict=True)
+        ranges = ", ".join(f"{channel} {low:.4g} to {high:.4g}" for channel, low, high in ends)
+        raise InputError(
+            name,
+            expected="commands that the twin can simulate",
+            got=f"{ranges}, with which {error}",
+            remedy="is each in the unit of the twin? Otherwise its equations or starts do not hold",
+        ) from error
     return found.replace(
         commands=commands,
-        nominal=twin.simulate(commands, seed=0).nominal,
+        nominal=nominal,
         observed=observed,
         mask=mask,
         rate=twin.rate,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import asdict
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -204,7 +204,11 @@ def evaluate(
         table(heads, rows, numbers=heads[2:6]),
         *_verdict(scores),
         *fitted_remarks(model, records, "these are no scores of new ones"),
-        *([] if ahead or begin else _start_remarks(updated, records, scores, units, seed)),
+        *(
+            []
+            if ahead or begin or _foreign(scores)
+            else _start_remarks(updated, records, scores, units, seed)
+        ),
         as_json=as_json,
     )
     if out is not None:
@@ -242,7 +246,7 @@ def _start_remarks(
     from retwin.evaluation import score_model
     from retwin.update.forecasts import unknown_starts
 
-    if not unknown_starts(model):
+    if not unknown_starts(model) or _foreign(usual):
         return []
     begin = _begin_of(records)
     if not records.mask[:, : round(begin * records.rate)].any(axis=(1, 2)).all():
@@ -266,8 +270,23 @@ MUCH = 0.8
 """Ratio of errors from which starts of records are named."""
 HARDLY = 0.02
 """Part of an error by which an update must lower it, not to be called one of bands alone."""
+FOREIGN, NOTHING = 2.0, 0.05
+"""Ratio of the error to the spread of a record from which, and share inside the band below which, a
+record may be of another channel or machine."""
 CLEAR = 0.01
 """Part of an error by which another predictor must be better to be mentioned."""
+
+
+def _foreign(scores: list[ModelScore]) -> list[str]:
+    """Outputs that the model has nothing in common with."""
+    spread = {each.output: each.rmse for each in scores if each.who == "mean"}
+    return [
+        each.output
+        for each in scores
+        if each.who == "model"
+        and each.rmse > FOREIGN * spread.get(each.output, inf)
+        and each.coverage < NOTHING
+    ]
 
 
 def _verdict(scores: list[ModelScore]) -> list[str]:
@@ -275,15 +294,22 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
     from retwin.scores.uses import COVERAGE
     from retwin.update.forecast_errors import LEVEL
 
-    made = []
+    own, foreign = {each.output: each for each in scores if each.who == "model"}, _foreign(scores)
+    made = [
+        f"{name}: the model is wrong by more than {FOREIGN:g} times what this record varies, and "
+        "its band holds nothing of it. Look first for another unit, another column, or another "
+        "machine than that of the calibration; judge one that integrates some time ahead, by "
+        "--horizon."
+        for name in foreign
+    ]
     words = {"twin": "the twin before its update", "mean": "the mean of the record itself"}
     words["hold"] = "the first sample" if scores[0].horizon is None else "the last measured sample"
-    for each in scores:
+    for each in (one for one in scores if one.output not in foreign):
         if each.who != "model":
-            own = next(s for s in scores if s.who == "model" and s.output == each.output)
-            if each.rmse < (1 - CLEAR) * own.rmse:
+            model = own[each.output]
+            if each.rmse < (1 - CLEAR) * model.rmse:
                 made.append(f"{each.output}: {words[each.who]} is a better prediction, by RMSE.")
-            elif each.who == "twin" and own.rmse > (1 - HARDLY) * each.rmse and not each.horizon:
+            elif each.who == "twin" and model.rmse > (1 - HARDLY) * each.rmse and not each.horizon:
                 made.append(
                     f"{each.output}: the RMSE is that of {words['twin']} within {HARDLY:.0%}: the "
                     "update adds bands alone there."

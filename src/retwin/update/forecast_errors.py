@@ -8,6 +8,7 @@ model was not fitted to.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
 from retwin.checks import require
+from retwin.data.trajectories import Trajectories
+from retwin.update.training_range import OutsideTrainingWarning
 
 LEVEL = 0.9
 """Probability of the intervals that are calibrated."""
@@ -26,6 +29,9 @@ FEW = 5
 """Independent samples below which no band is promised: the 90 % quantile of four is none."""
 BY_LEAD = ("persistence", "deviation", "independent")
 """Fields of `ForecastErrors` with a row for each time ahead, in their order."""
+UNLIKE = 0.5
+"""Share of the width of its range by which half of the samples leave it in another unit or another
+channel."""
 BEYOND = 0.05
 """Share of the width of its range by which a value may leave it, as noise makes it."""
 
@@ -155,6 +161,33 @@ class ForecastErrors:
             drifts=drifts,
             started=None if started is None else np.array(started, dtype=float),
             **arrays,
+        )
+
+
+def warn_unlike(model: object, records: Trajectories) -> None:
+    """Warn of channels of which half of the samples are far outside the range of the calibration.
+
+    Nothing is known of a model without calibrated bands.
+    """
+    errors: ForecastErrors | None = getattr(model, "forecast", None)
+    if errors is None:
+        return
+    measured = np.where(records.mask, records.observed, np.nan)
+    values = np.concatenate([records.commands, measured], axis=2)
+    names = (*records.inputs.names, *records.outputs.names)
+    ends = zip(names, *value_range(values), errors.low, errors.high, strict=True)
+    found = []
+    for i, (name, least, most, low, high) in enumerate(ends):
+        own = values[np.isfinite(values[..., i])][:, None, [i]]
+        excess = range_excess(own, errors.low[[i]], errors.high[[i]])
+        if own.size and np.median(excess) > UNLIKE:
+            found.append(f"{name} is {least:.4g} to {most:.4g} here, {low:.4g} to {high:.4g} there")
+    if found:
+        warnings.warn(
+            f"these records are unlike those of the calibration: {'; '.join(found)}. Is it another "
+            "unit, or another column?",
+            OutsideTrainingWarning,
+            stacklevel=3,
         )
 
 

@@ -13,7 +13,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.scores.distributions import crps_normal
 from retwin.scores.intervals import grouped_share_interval
 from retwin.twins.twin import Twin, check_channels
-from retwin.update.forecast_errors import USUAL, ForecastErrors
+from retwin.update.forecast_errors import USUAL, ForecastErrors, warn_unlike
 from retwin.update.forecasts import forecasts, free_moments, started_moments
 from retwin.update.training_range import OutsideTrainingWarning
 
@@ -103,6 +103,7 @@ def predict_records(
 
     """
     check_channels(model, records, "records")
+    warn_unlike(model, records)
     errors: ForecastErrors | None = getattr(model, "forecast", None)
     if horizon is None:
         mean, deviation = _simulate_free(model, records, started, seed)
