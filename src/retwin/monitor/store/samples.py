@@ -124,8 +124,7 @@ def parse(
         No such document, more than 100 000 samples, or an unknown machine or channel.
 
     """
-    times: dict[str, list[int]] = {}
-    rows: dict[str, list[list[float]]] = {}
+    rows: dict[str, list[tuple[int, list[float]]]] = {}
     known: dict[str, dict[str, int]] = {}
     trajectories: list[Samples | Trajectory] = []
     count = 0
@@ -133,8 +132,8 @@ def parse(
     for number, each in enumerate(_objects(document)):
         place = f"sample {number}"
         given = each.get("values") if isinstance(each, dict) else None
-        given = given if isinstance(given, dict) else {}
-        length = max(map(_length, given.values()), default=0)
+        columns = given.values() if isinstance(given, dict) else ()
+        length = max((len(column) for column in columns if isinstance(column, list)), default=0)
         count += max(1, length)
         at_most("samples", count, LONGEST, "in a document", remedy="send them in parts")
         require(
@@ -149,17 +148,16 @@ def parse(
             raise _refused(f"{place}: asset", name, "its name" if asset is None else repr(asset))
         if name not in known:
             known[name] = {channel: i for i, channel in enumerate(channels(name))}
+        time, block = _time(each, place), _block(given, length, known[name], place)
         if length:
-            columns = _columns(given, length, place)
-            block = [_row(row, known[name], place) for row in columns]
-            trajectories.append(Trajectory(name, _time(each, place), np.array(block)))
-            continue
-        times.setdefault(name, []).append(_time(each, place))
-        rows.setdefault(name, []).append(_row(each["values"], known[name], place))
-    return [
-        *(Samples(name, np.array(times[name], np.int64), np.array(rows[name])) for name in times),
-        *trajectories,
-    ]
+            trajectories.append(Trajectory(name, time, np.array(block)))
+        else:
+            rows.setdefault(name, []).append((time, block[0]))
+    samples = []
+    for name, own in rows.items():
+        times, values = zip(*own, strict=True)
+        samples.append(Samples(name, np.array(times, np.int64), np.array(values)))
+    return [*samples, *trajectories]
 
 
 def _objects(document: bytes | str) -> Iterator[Any]:
@@ -211,41 +209,33 @@ def _time(each: dict[str, Any], place: str) -> int:
     raise _refused(f"{place}: time", given, expected)
 
 
-def _length(value: Any) -> int:
-    """Of an array; 0 for a number."""
-    return len(value) if isinstance(value, list) else 0
+def _block(values: Any, length: int, places: dict[str, int], place: str) -> list[list[float]]:
+    """The values (T, channels) of a trajectory, or of one sample if its length is 0.
 
-
-def _columns(values: dict[str, Any], length: int, place: str) -> Iterator[dict[str, Any]]:
-    """The values of each sample of a trajectory, whose channels are arrays of one length."""
-    for name, value in values.items():
-        if _length(value) != length:
-            raise InputError(
-                f"{place}: {repr(name)[:60]}",
-                expected=f"an array of {length} numbers, as another channel has",
-                got=f"{_length(value)}" if isinstance(value, list) else repr(value)[:60],
-                remedy="send one value per sample of each channel, null where it is missing",
-            )
-    return (dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True))
-
-
-def _row(values: Any, places: dict[str, int], place: str) -> list[float]:
-    """The values of all channels; NaN where one is missing."""
-    made = [np.nan] * len(places)
+    NaN where one is missing.
+    """
     if not isinstance(values, dict):
         raise _refused(f"{place}: values", values, "an object of channels")
+    made = [[np.nan] * len(places) for _ in range(max(1, length))]
     for name, value in values.items():
         if name not in places:
             expected = f"channels among {', '.join(places)}"
             remedy = "leave it out, or correct its name"
             raise _refused(f"{place}: values", name, expected, remedy)
-        if value is None:
-            continue
-        try:
-            if not isinstance(value, int | float):
-                raise TypeError
-            made[places[name]] = float(value)
-        except (TypeError, OverflowError):
-            remedy = "send numbers as JSON numbers"
-            raise _refused(f"{place}: {name}", value, "a number or null", remedy) from None
+        column, several = value if length else [value], isinstance(value, list)
+        if length and not (several and len(value) == length):
+            raise InputError(
+                f"{place}: {repr(name)[:60]}",
+                expected=f"an array of {length} numbers, as another channel has",
+                got=str(len(value)) if several else repr(value)[:60],
+                remedy="send one value per sample of each channel, null where it is missing",
+            )
+        for row, each in zip(made, column, strict=True):
+            try:
+                if not isinstance(each, int | float | None):
+                    raise TypeError
+                row[places[name]] = np.nan if each is None else float(each)
+            except (TypeError, OverflowError):
+                remedy = "send numbers as JSON numbers"
+                raise _refused(f"{place}: {name}", each, "a number or null", remedy) from None
     return made
