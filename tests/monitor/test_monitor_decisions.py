@@ -18,8 +18,7 @@ from retwin.monitor.detect.events import CHANGED, FOLLOWS, Course
 from retwin.monitor.detect.promise import FalseAlarmTest
 from retwin.monitor.detect.scores import fit_scores
 from retwin.monitor.detect.slack import Slack
-from retwin.monitor.live.machine import Counts
-from retwin.monitor.live.status import AssetStatus
+from retwin.monitor.live.machine import AssetStatus, Counts
 from retwin.monitor.live.stream_machine import BEHIND, TOLERATED, WINDOW, StreamMachine, Work
 from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.models import cause, visibility

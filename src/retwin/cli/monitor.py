@@ -231,8 +231,8 @@ def _replay_trajectories(
 ) -> None:
     """Watch recorded trajectories of one machine, file after file."""
     from retwin.monitor import TrajectoryMonitor
-    from retwin.monitor.live.sentences import REMEDY
-    from retwin.monitor.models.trajectory.watched import REMARKS
+    from retwin.monitor.live.notifications import REMEDY
+    from retwin.monitor.models.trajectory.state import REMARKS
 
     made, system, state = TrajectoryMonitor.load(monitor), case_named(case), None
     rows, found, texts = [], [], []

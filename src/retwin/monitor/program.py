@@ -23,8 +23,8 @@ from retwin.monitor.live.notifications import (
     FileChannel,
     Notifications,
     Receiver,
+    sentence,
 )
-from retwin.monitor.live.sentences import sentence
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.server import create_app, listening, serving
@@ -37,13 +37,12 @@ from retwin.monitor.settings import (
     TwinSettings,
     secret,
 )
-from retwin.monitor.sources.folder import Folder
+from retwin.monitor.sources.folder import Folder, Recorded, TrajectoryFolder
 from retwin.monitor.sources.layouts import layout_of, mapped_layout
 from retwin.monitor.sources.mqtt import Mqtt
 from retwin.monitor.sources.opcua import OpcUa
 from retwin.monitor.sources.source import Source
 from retwin.monitor.sources.tables import Layout
-from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
 from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 from retwin.serialisation.files import sha256

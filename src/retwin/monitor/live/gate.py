@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from retwin.errors import InputError
 from retwin.monitor.live.live import Live
-from retwin.monitor.live.status import Received
+from retwin.monitor.live.machine import Received
 from retwin.monitor.store.samples import Samples, Trajectory
 
 QUEUE = 10_000

@@ -15,15 +15,14 @@ import numpy as np
 
 from retwin.checks import finite, given, instance, require, whole
 from retwin.monitor.live.layout import Layout
-from retwin.monitor.live.machine import Counts, Recent
-from retwin.monitor.live.status import AssetStatus, Received
+from retwin.monitor.live.machine import AssetStatus, Counts, Received, Recent
 from retwin.monitor.live.stream_machine import StreamMachine, Work, step
 from retwin.monitor.live.trajectory_machine import TrajectoryMachine
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.store.audit import Entry
-from retwin.monitor.store.limits import Limits
+from retwin.monitor.store.gridded import Limits
 from retwin.monitor.store.samples import SECOND, Samples, Trajectory
 from retwin.monitor.store.store import Store
 from retwin.monitor.store.updates import LATEST, Asset, one_asset

@@ -17,7 +17,7 @@ from retwin.monitor.live.layout import Layout
 from retwin.monitor.live.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.watched import Watched
-from retwin.monitor.store.limits import Limits
+from retwin.monitor.store.gridded import Limits
 from retwin.monitor.store.samples import SECOND, Samples
 from retwin.monitor.store.updates import EARLIEST, Asset, Update
 

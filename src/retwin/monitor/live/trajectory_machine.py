@@ -17,8 +17,7 @@ from retwin.errors import InputError, brief
 from retwin.monitor.live.machine import KEPT, Machine, Recent
 from retwin.monitor.models.cause import cause_data
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
-from retwin.monitor.models.trajectory.state import TrajectoryState
-from retwin.monitor.models.trajectory.watched import REMARKS, WatchedTrajectories
+from retwin.monitor.models.trajectory.state import REMARKS, TrajectoryState, WatchedTrajectories
 from retwin.monitor.store.gridded import record_of
 from retwin.monitor.store.samples import Samples, Trajectory
 from retwin.monitor.store.updates import Asset, Update

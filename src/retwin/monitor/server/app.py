@@ -21,7 +21,7 @@ from retwin.errors import InputError
 from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.gate import Gate
 from retwin.monitor.live.live import Live
-from retwin.monitor.live.status import Received
+from retwin.monitor.live.machine import Received
 from retwin.monitor.server.comparison import Comparisons
 from retwin.monitor.server.guard import RequestGuard
 from retwin.monitor.server.metrics import Metrics

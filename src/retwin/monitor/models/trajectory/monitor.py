@@ -36,8 +36,11 @@ from retwin.monitor.models.trajectory.evidence import (
     factors,
     twin_of,
 )
-from retwin.monitor.models.trajectory.state import TrajectoryState
-from retwin.monitor.models.trajectory.watched import TrajectoryAlarm, WatchedTrajectories
+from retwin.monitor.models.trajectory.state import (
+    TrajectoryAlarm,
+    TrajectoryState,
+    WatchedTrajectories,
+)
 from retwin.progress import Progress
 from retwin.serialisation.models import check_weights, read_model, refusing, write_model
 
