@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from retwin.checks import require
+from retwin.checks import at_least
 from retwin.data.trajectories import UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.live.live import Live
@@ -208,13 +208,8 @@ class Explanations:
         begin = max(opening, last["time"] - round(last["sample"] * period))
         half = round(period / 2)
         times, values = gridded(store, name, monitor.twin, begin - half, last["time"] + half)
-        require(
-            len(times) >= 2,
-            "samples",
-            expected="at least two before the alarm in the store",
-            got=len(times),
-            remedy="store more of them: see max_samples",
-        )
+        remedy = "store more of them: see max_samples"
+        at_least("samples", times, 2, "before the alarm in the store", remedy=remedy)
         record = record_of(monitor.twin, values)
         *earlier, newest = [_alarm(each.data, int(times[0]), period) for each in entries]
         alarms = [*earlier, replace(newest, sample=record.steps - 1)]

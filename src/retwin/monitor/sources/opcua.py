@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra, require, same_names
+from retwin.checks import existing, needs_extra, require, same_names
 from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
 from retwin.monitor.live.gate import Gate
 from retwin.monitor.settings import OpcUaSource, secret
 from retwin.monitor.sources.source import AGAIN, Source
 from retwin.monitor.store.samples import Samples
+from retwin.serialisation.files import refusing
 
 
 @dataclass
@@ -96,6 +97,8 @@ LONGEST = 1.0
 """Seconds between two publications, at most."""
 QUEUE = 1000
 """Values of a node that the server keeps while the connection is lost."""
+FILES = "give the files that the server's administrator made"
+"""What to do where one cannot be used."""
 MARGIN = 1.5
 """Intervals of publication for which a sample waits for channels that may not have changed."""
 
@@ -139,12 +142,8 @@ class OpcUa(Source):
         self._settings = settings
         for name in ("cert_file", "key_file", "server_file"):
             file = getattr(settings, name)
-            require(
-                file is None or file.is_file(),
-                f"sources.{name}",
-                expected="a file",
-                got=f"{file}, which is none",
-                remedy="give the files that the server's administrator made",
+            existing(
+                f"sources.{name}", file, file is None or file.is_file(), "a file", remedy=FILES
             )
         self._password = secret("password of the server", settings.password_env)
         shortest = min(1 / rates[asset] for asset in settings.nodes)
@@ -229,7 +228,8 @@ class OpcUa(Source):
         tools = needs_extra("asyncua.crypto.uacrypto", "monitor", purpose)
         policies = needs_extra("asyncua.crypto.security_policies", "monitor", purpose)
         x509 = needs_extra("cryptography.x509", "monitor", purpose)
-        try:
+        expected = "a certificate with the URI of the application, and its key, as PEM files"
+        with refusing("sources.cert_file", expected=expected, remedy=FILES):
             names = (await tools.load_certificate(own.cert_file)).extensions
             found = names.get_extension_for_class(x509.SubjectAlternativeName).value
             # A server compares it with the certificate.
@@ -238,13 +238,6 @@ class OpcUa(Source):
             server = own.server_file and tools.CertProperties(own.server_file)
             if own.server_file:
                 await tools.load_certificate(own.server_file)
-        except (OSError, ValueError, IndexError, x509.ExtensionNotFound) as error:
-            raise InputError(
-                "sources.cert_file",
-                expected="a certificate with the URI of the application, and its key, as PEM files",
-                got=brief(error),
-                remedy="give the files that the server's administrator made",
-            ) from None
         policy = getattr(policies, f"SecurityPolicy{own.security}")
         await client.set_security(policy, own.cert_file, own.key_file, None, server)
 
@@ -252,16 +245,10 @@ class OpcUa(Source):
         self.lost(brief(error))
 
     def _node(self, text: str) -> Any:
-        ua = self._asyncua.ua
-        try:
-            return ua.NodeId.from_string(text)
-        except ua.UaError as error:
-            raise InputError(
-                "sources.nodes",
-                expected='addresses of nodes, "ns=2;s=NAME" or "ns=2;i=NUMBER"',
-                got=f"{text!r} ({brief(error)})",
-                remedy="take them from a browser of the server",
-            ) from None
+        expected = 'addresses of nodes, "ns=2;s=NAME" or "ns=2;i=NUMBER"'
+        remedy = "take them from a browser of the server"
+        with refusing(f"sources.nodes: {text!r}", expected=expected, remedy=remedy):
+            return self._asyncua.ua.NodeId.from_string(text)
 
     def _items(self, subscription: Any) -> list[Any]:
         """What the server is asked for: each new value or time of each node."""

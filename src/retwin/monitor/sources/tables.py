@@ -22,7 +22,8 @@ from retwin.data.logs.signals import NANOSECOND, Clock, Signal, TimeUnit, named_
 from retwin.data.logs.units import same_unit
 from retwin.data.row_times import time_column, times_that_are
 from retwin.data.tables import Table, text_table
-from retwin.errors import InputError, brief
+from retwin.errors import brief
+from retwin.serialisation.files import refusing
 
 CHUNK = 2**16
 """Bytes of a CSV file, and of one of its rows, that are read at once."""
@@ -190,17 +191,10 @@ class GrowingTable(ABC):
         Where the file was replaced or truncated, or its begin was changed, all rows are new again.
         Raises InputError where it is no table, or lacks a column.
         """
-        try:
+        expected = f"a table with columns {', '.join(self.layout.wanted)}"
+        remedy = "correct it, or name the columns as the file does"
+        with refusing(self.path, expected=expected, remedy=remedy):
             yield from self._rows()
-        except InputError:
-            raise
-        except Exception as error:  # of the libraries too, whose classes are many
-            raise InputError(
-                str(self.path),
-                expected=f"a table with columns {', '.join(self.layout.wanted)}",
-                got=f"{type(error).__name__}: {brief(error)}",
-                remedy="correct it, or name the columns as the file does",
-            ) from None
 
     @abstractmethod
     def _rows(self) -> Iterator[Rows]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra, nothing, require
+from retwin.checks import existing, needs_extra, nothing, require
 from retwin.errors import InputError, brief
 from retwin.monitor.store.audit import Entry
 
@@ -114,13 +114,8 @@ class Database:
             self._engine = sa.create_engine(address, connect_args={"connect_timeout": 10})
             sa.event.listen(self._engine, "connect", self._prepare_postgresql)
         else:
-            require(
-                file.is_file() or not read_only,
-                "folder",
-                expected=f"the folder of a store, with {file.name}",
-                got=str(file.parent),
-                remedy="check the name",
-            )
+            what = f"the folder of a store, with {file.name}"
+            existing("folder", file.parent, file.is_file() or not read_only, what)
             self.name = str(file)
             self._engine = sa.create_engine(sa.URL.create("sqlite", database=str(file)))
             sa.event.listen(self._engine, "connect", self._prepare_sqlite)

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from retwin.checks import at_most, require
 from retwin.data.logs.signals import nanoseconds
-from retwin.errors import InputError, brief
+from retwin.errors import InputError
 from retwin.monitor.store.updates import EARLIEST, LATEST
+from retwin.serialisation.files import refusing
 
 SECOND = 10**9
 """Nanoseconds of a second."""
@@ -162,7 +163,8 @@ def parse(
 
 def _objects(document: bytes | str) -> Iterator[Any]:
     """The objects of a document: one, those of an array, or one of each line."""
-    try:
+    expected = "a JSON object, an array of them, or one on each line"
+    with refusing("samples", expected=expected, remedy=REMEDY):
         text = document if isinstance(document, str) else document.decode("utf-8")
         lines = [each for each in text.split("\n") if each.strip()]
         try:
@@ -170,17 +172,9 @@ def _objects(document: bytes | str) -> Iterator[Any]:
         except json.JSONDecodeError:
             if len(lines) < 2:
                 raise
-            for each in lines:
-                yield json.loads(each)
+            yield from map(json.loads, lines)
         else:
             yield from whole if isinstance(whole, list) else [whole]
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            "samples",
-            expected="a JSON object, an array of them, or one on each line",
-            got=f"{type(error).__name__}: {brief(error)}",
-            remedy=REMEDY,
-        ) from None
 
 
 def _refused(place: str, given: object, expected: str, remedy: str = REMEDY) -> InputError:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import instance, require, whole
+from retwin.checks import instance, one_per, require, whole
 from retwin.monitor.store import database
 from retwin.monitor.store.audit import START, Entry, append, canonical
 from retwin.monitor.store.database import (
@@ -193,13 +193,7 @@ class Store:
             known = self._known(connection)
             packed = [pack(each, known) for each in updates]
             names = [each.asset for each in packed]
-            require(
-                len(set(names)) == len(names),
-                "updates",
-                expected="one per asset",
-                got="several of one",
-                remedy="join the samples of an asset",
-            )
+            one_per("updates", names, len(set(names)), "asset", remedy="join the samples of each")
             repeated = {}
             rows = []
             for each in packed:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import agree, given, require
+from retwin.checks import agree, at_least, given, require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.inversion.trajectories import InversionDiagnoser
 from retwin.evaluation.fidelity.simulation import simulate_records
@@ -37,6 +37,8 @@ TRAJECTORIES_BEFORE = 10
 """Trajectories before an alarm that are left out: its cause may already act in them."""
 DRAWS = 200
 """Simulations of each trajectory; the CRPS has no bias by their number."""
+LATER = "compare the versions later"
+"""What to do where too little is stored."""
 KINDS: Mapping[type, str] = {Monitor: "samples", TrajectoryMonitor: "trajectories"}
 
 
@@ -113,13 +115,8 @@ def _of_samples(store: Store, twin: str, watching: Sequence[Any]) -> Scored:
         found = [crps_normal(known, each.mean, each.deviation) for each in seen[:2]]
         scores.append([_mean((each / unit)[0]) for each in found])
         alarms += [len(each.events) for each in seen]
-    require(
-        scores,
-        "samples",
-        expected=f"at least {2 * MIN_SAMPLES} without an alarm, of one asset",
-        got="fewer",
-        remedy="compare the versions later",
-    )
+    expected = f"at least {2 * MIN_SAMPLES} without an alarm, of one asset"
+    require(scores, "samples", expected=expected, got="fewer", remedy=LATER)
     samples = max(sum(int(np.isfinite(each[1]).sum()) for each in scores), 1)
     counted = list(zip(alarms.tolist(), watching, strict=True))[1:]
     return scores, [FalseAlarmTest(count, samples, each.arl) for count, each in counted]
@@ -138,14 +135,8 @@ def _of_trajectories(store: Store, twin: str, watching: Sequence[Any]) -> Scored
         for part in _healthy_trajectories(store, twin, old)
     ]
     every = [each for part in machines for each in part]
-    require(
-        len(every) >= MIN_TRAJECTORIES,
-        "trajectories",
-        expected=f"at least {MIN_TRAJECTORIES} healthy ones that are stored, of all machines "
-        "together",
-        got=len(every),
-        remedy="compare the versions later",
-    )
+    what = "healthy ones that are stored, of all machines together"
+    at_least("trajectories", every, MIN_TRAJECTORIES, what, remedy=LATER)
     unit = _deviation(every)
     twins = [_predicting(each) for each in watching[:2]]
     length = len(every) // BLOCKS
