@@ -142,9 +142,8 @@ class OpcUa(Source):
         self._settings = settings
         for name in ("cert_file", "key_file", "server_file"):
             file = getattr(settings, name)
-            existing(
-                f"sources.{name}", file, file is None or file.is_file(), "a file", remedy=FILES
-            )
+            there = file is None or file.is_file()
+            existing(f"sources.{name}", file, there, "a file", remedy=FILES)
         self._password = secret("password of the server", settings.password_env)
         shortest = min(1 / rates[asset] for asset in settings.nodes)
         self._interval = settings.interval or min(shortest / 2, LONGEST)
