@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import to_jsonable_python
+from starlette.exceptions import HTTPException
 
 from retwin._version import __version__
 from retwin.checks import at_most, needs_extra
@@ -158,9 +159,7 @@ def _report_errors(app: fastapi.FastAPI) -> None:
 
     app.add_exception_handler(InputError, refused)
     app.add_exception_handler(fastapi.exceptions.RequestValidationError, invalid)
-    app.add_exception_handler(404, unknown)
-    app.add_exception_handler(405, unknown)
-    app.add_exception_handler(fastapi.HTTPException, unknown)
+    app.add_exception_handler(HTTPException, unknown)
 
 
 def _add_page(app: fastapi.FastAPI) -> None:
