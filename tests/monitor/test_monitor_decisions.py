@@ -25,12 +25,11 @@ from retwin.monitor.models import cause, visibility
 from retwin.monitor.models.cause import MIN_WINDOW, PROBABLE, Cause, cause_data, cause_text, is_due
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import BEYOND, Monitor
-from retwin.monitor.models.parts import Part
 from retwin.monitor.models.trajectory import monitor as trajectories
 from retwin.monitor.models.trajectory.evidence import Compared
 from retwin.monitor.models.trajectory.monitor import COMPARABLE, SHOWN, TrajectoryMonitor
 from retwin.monitor.models.visible import SHARE, Visible
-from retwin.monitor.models.watched import Alarm, Ending
+from retwin.monitor.models.watched import Alarm, Ending, Part
 from retwin.monitor.server import journal, views
 from retwin.monitor.store.samples import Samples, Trajectory
 from retwin.monitor.store.updates import Asset

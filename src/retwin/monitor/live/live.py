@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from retwin.checks import finite, given, instance, require, whole
-from retwin.monitor.live.layout import Layout
 from retwin.monitor.live.machine import AssetStatus, Counts, Received, Recent
 from retwin.monitor.live.stream_machine import StreamMachine, Work, step
 from retwin.monitor.live.trajectory_machine import TrajectoryMachine
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
 from retwin.monitor.models.monitor import Monitor
+from retwin.monitor.models.monitor_state import Layout
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.gridded import Limits
@@ -377,7 +377,7 @@ class Live:
                 watched.restore(*stored)
             return watched
         if digest not in self._layouts:
-            self._layouts[digest] = Layout(monitor, digest)
+            self._layouts[digest] = Layout(monitor.start(1), digest)
         machine = StreamMachine(asset, monitor, self._layouts[digest], self._wait)
         if stored is not None and machine.restore(stored[1]):
             for times, values in self.store.samples(asset.name, machine.stepped_time):

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.monitor.live.layout import Layout
 from retwin.monitor.live.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.models.monitor import Monitor
+from retwin.monitor.models.monitor_state import Layout
 from retwin.monitor.models.watched import Watched
 from retwin.monitor.store.gridded import Limits
 from retwin.monitor.store.samples import SECOND, Samples
@@ -169,13 +169,7 @@ class StreamMachine(Machine[Monitor]):
         """The monitor's state before these samples, as a row of the layout."""
         return self.layout.start if work.begins else self._state
 
-    def stepped(
-        self,
-        work: Work,
-        state: NDArray,
-        watched: Watched,
-        row: int,
-    ) -> None:
+    def stepped(self, work: Work, state: NDArray, watched: Watched, row: int) -> None:
         """Take the state after these samples, and what was found in them, a row of `watched`."""
         name = self.asset.name
         alarms = [each for each in watched.alarms if each.trajectory == name]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from numpy.typing import NDArray
+
+from retwin.monitor.models.monitor_state import MonitorState
 
 
 @dataclass(frozen=True)
@@ -111,3 +114,28 @@ class Watched:
     def events(self) -> list[Alarm]:
         """The first alarm of each event."""
         return [each for each in self.alarms if each.opens]
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What was found in T samples of n machines, none of which begins anew before the last."""
+
+    after: MonitorState
+    mean: NDArray
+    deviation: NDArray
+    low: NDArray
+    high: NDArray
+    evidence: NDArray
+    total: NDArray
+    end_evidence: NDArray
+    alarm: NDArray
+    ended: NDArray
+    changed: NDArray
+    counted: NDArray
+    outside: NDArray
+
+    @property
+    def until(self) -> int:
+        """Samples up to the first alarm or end of an event of any machine; else all."""
+        any_ = (self.alarm | self.ended | self.changed).any(axis=0)
+        return int(np.argmax(any_)) + 1 if any_.any() else len(any_)
