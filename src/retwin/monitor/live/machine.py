@@ -211,15 +211,15 @@ class AssetStatus:
     impossible: str = ""
 
     @classmethod
-    def of(cls, machine: Machine[Any], arl: float) -> AssetStatus:
-        """The status of a machine whose alarms have that threshold."""
+    def of(cls, machine: Machine[Any]) -> AssetStatus:
+        """The status of a machine."""
         same = ("alarms", "last_alarm", "event", "void", "outside", "rate", "impossible")
         return cls(
             asset=machine.asset.name,
             twin=machine.asset.settings["twin"],
             version=machine.asset.version or 0,
             time=machine.newest,
-            ratio=machine.evidence / arl,
+            ratio=machine.evidence / machine.monitor.arl,
             counts=vars(machine.counts).copy(),
             **{name: getattr(machine, name) for name in same},
         )
