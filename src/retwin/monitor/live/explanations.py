@@ -19,7 +19,6 @@ from retwin.monitor.live.live import Live
 from retwin.monitor.models.cause import (
     BEFORE,
     EVENT,
-    Cause,
     cause_data,
     find_cause,
     is_due,
@@ -185,7 +184,7 @@ class Explanations:
         entry = alarms[-1]
         alarm = entry.data
         try:
-            found = _data(*self._found(alarms))
+            found = self._found(alarms)
         except Exception as error:  # Whatever fails is an entry, and the next alarm is explained.
             same = _event(alarm) != alarm["time"]
             found = cause_data(UNKNOWN, 0.0, 1.0, {}) | {"note": brief(error), "same": same}
@@ -197,8 +196,8 @@ class Explanations:
         except Exception:  # of the caller; further alarms are explained all the same
             logging.getLogger(__name__).exception("a cause was found but not reported")
 
-    def _found(self, entries: list[Entry]) -> tuple[Cause, int]:
-        """The cause of the last alarm, and the time of the first sample that it was found from."""
+    def _found(self, entries: list[Entry]) -> dict[str, Any]:
+        """The cause of the last alarm as data of the log."""
         store, last = self._live.store, entries[-1].data
         name = last["asset"]
         twin = next(each for each in store.assets() if each.name == name).settings["twin"]
@@ -214,7 +213,7 @@ class Explanations:
         *earlier, newest = [_alarm(each.data, int(times[0]), period) for each in entries]
         alarms = [*earlier, replace(newest, sample=record.steps - 1)]
         current, unexplained = self._current.get((name, _event(last)), ("", 0.0))
-        found = find_cause(
+        cause = find_cause(
             monitor.twin,
             record,
             alarms,
@@ -223,7 +222,12 @@ class Explanations:
             unexplained=unexplained,
             known_start=False,
         )
-        return found, int(times[0])
+        first, ends = int(times[0]), (cause.size, cause.onset)
+        size, onset = ([each if np.isfinite(each) else None for each in end] for end in ends)
+        moments = [None if each is None else first + round(each * SECOND) for each in onset]
+        shares = cause.probability, cause.unknown, cause.probabilities
+        data = cause_data(cause.name, *shares, size, cause.unit, moments, limit=cause.limit)
+        return data | {"same": cause.same}
 
 
 def _alarm(data: dict[str, Any], first: int, period: float) -> Alarm:
@@ -236,12 +240,3 @@ def _alarm(data: dict[str, Any], first: int, period: float) -> Alarm:
 def _event(alarm: Mapping[str, Any]) -> int:
     """The time of the first alarm of an alarm's event."""
     return int(alarm.get("event", alarm["time"]))
-
-
-def _data(cause: Cause, first: int) -> dict[str, Any]:
-    """A cause as data of the log, whose first sample was at a time in nanoseconds."""
-    size = [each if np.isfinite(each) else None for each in cause.size]
-    onset = [first + round(each * SECOND) if np.isfinite(each) else None for each in cause.onset]
-    shares = cause.probability, cause.unknown, cause.probabilities
-    data = cause_data(cause.name, *shares, size, cause.unit, onset, limit=cause.limit)
-    return data | {"same": cause.same}

@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import Protocol
 
 from retwin.checks import needs_extra, require
-from retwin.errors import InputError, brief
+from retwin.errors import brief
 from retwin.monitor.models.cause import cause_text
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.store.store import Store
-from retwin.serialisation.files import write_atomically
+from retwin.serialisation.files import refusing, write_atomically
 
 FIRST, LONGEST = 1.0, 300.0
 """Seconds after which a message that failed is sent again at first, and at most."""
@@ -207,19 +207,12 @@ class Notifications:
 
 def _read(file: Path) -> dict[str, int]:
     """The newest entry that each receiver was sent, as an earlier run has left it."""
-    try:
-        return {
-            str(name): int(sequence) for name, sequence in json.loads(file.read_bytes()).items()
-        }
-    except FileNotFoundError:
+    if not file.exists():
         return {}
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise InputError(
-            str(file),
-            expected="a file that says which entries were sent",
-            got=brief(error),
-            remedy="remove it: then only new entries are sent",
-        ) from None
+    expected = "a file that says which entries were sent"
+    with refusing(file, expected=expected, remedy="remove it: then only new entries are sent"):
+        sent = json.loads(file.read_bytes())
+        return {str(name): int(sequence) for name, sequence in sent.items()}
 
 
 REMEDY = (

@@ -93,7 +93,9 @@ class StreamMachine(Machine[Monitor]):
         self._limits = Limits.of(monitor.twin, asset.settings.get("limits", {}))
         self._doubtful = np.zeros(asset.channels)
         """Places until each channel counts as possible again; 0 for one that is."""
-        self._recent: deque[tuple[NDArray, ...]] = deque()
+        commands, measured = np.split(self._missing[None, :][:0], [self._commands], axis=1)
+        none = np.zeros(0, dtype=np.int64), commands, measured, measured, measured, np.zeros(0)
+        self._recent: deque[tuple[NDArray, ...]] = deque([none])
         self._kept = 0
 
     @property
@@ -206,13 +208,7 @@ class StreamMachine(Machine[Monitor]):
 
     def recent(self) -> Recent:
         """The newest samples."""
-        if not self._recent:
-            inputs, outputs = self._commands, self.asset.channels - self._commands
-            none, times = np.zeros((0, outputs)), np.zeros(0, dtype=np.int64)
-            return Recent(times, np.zeros((0, inputs)), none, none, none, np.zeros(0))
-        times, *more = (np.concatenate(each)[-KEPT:] for each in zip(*self._recent, strict=True))
-        commands, measured, mean, deviation, evidence = more
-        return Recent(times, commands, measured, mean, deviation, evidence)
+        return Recent(*(np.concatenate(each)[-KEPT:] for each in zip(*self._recent, strict=True)))
 
     def update(self) -> Update | None:
         """Samples that are not stored yet, and the state after those that were stepped."""

@@ -109,8 +109,18 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         watched, samples = found.watched, found.samples
         assert watched is not None
         last = int(samples.times[-1])
-        for number in range(len(watched.alarms)):
-            self._alarm(found, watched, number)
+        for alarm in watched.alarms:  # with its cause, which is known at once
+            shares = alarm.probability, alarm.shares.get(UNKNOWN, 0.0), alarm.shares
+            self.log(
+                "alarm",
+                last,
+                sample=alarm.number,
+                begin=int(samples.times[0]),
+                output=f"trajectory {alarm.number + 1}",
+                change="unlike the healthy machine" + ", with commands outside" * alarm.outside,
+                evidence=alarm.evidence,
+                cause=cause_data(alarm.name, *shares),
+            )
         if watched.void[-1] and not self.void:
             self.log("void", last)
         remark = next((i for i, name in enumerate(UNUSUAL, 1) if getattr(watched, name)[-1]), 0)
@@ -173,20 +183,4 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
             np.zeros_like(values),
             np.ones_like(values),
             evidence.astype(float),
-        )
-
-    def _alarm(self, found: Diagnosed, watched: WatchedTrajectories, number: int) -> None:
-        """Log an alarm with its cause, which is known at once."""
-        alarm, times = watched.alarms[number], found.samples.times
-        unknown = alarm.shares.get(UNKNOWN, 0.0)
-        cause = cause_data(alarm.name, alarm.probability, unknown, alarm.shares)
-        self.log(
-            "alarm",
-            int(times[-1]),
-            sample=alarm.number,
-            begin=int(times[0]),
-            output=f"trajectory {alarm.number + 1}",
-            change="unlike the healthy machine" + ", with commands outside" * alarm.outside,
-            evidence=alarm.evidence,
-            cause=cause,
         )

@@ -49,9 +49,6 @@ GROWTH = 0.25
 AT_LIMIT = 0.02
 """Share of the range of a fault's size within which its interval is at an end of it."""
 
-PARTS = ("value", "low", "high")
-"""Of an estimate."""
-
 
 @dataclass(frozen=True)
 class Cause:
@@ -95,24 +92,20 @@ class Cause:
     limit: bool = False
 
 
-def cause_title(name: str) -> str:
-    """A cause as it is shown: an alarm that the healthy class explains best has no known cause."""
-    return "no known fault" if name == HEALTHY else name
-
-
 def cause_text(cause: Mapping[str, Any], since: str) -> str:
     """A cause with its onset, size and probability, and whether there is more to it.
 
     Of a `Cause` as a mapping, or of `cause_data`; `since` is its onset, "" where that is not known.
     """
-    more = cause["unknown"] > PROBABLE and cause["name"] != HEALTHY
-    text = cause_title(cause["name"]) + (f" from {since}" if since else "")
+    known = cause["name"] != HEALTHY  # else it explains the alarm best, which has no known cause
+    more = cause["unknown"] > PROBABLE and known
+    text = (cause["name"] if known else "no known fault") + (f" from {since}" if since else "")
     text += ", and more than that" if since and more else ""
     value, low, high = cause["size"]
     of = f" {cause['unit']}" if cause["unit"] not in ("", "1") else ""
-    known = value is not None and np.isfinite(value)
     end = " at the end of its range" if cause["limit"] else ""
-    size = f"size {value:.3g}{of} ({low:.3g} to {high:.3g}){end}, " if known else ""
+    sized = value is not None and np.isfinite(value)
+    size = f"size {value:.3g}{of} ({low:.3g} to {high:.3g}){end}, " if sized else ""
     among = " among the known causes" if more else ""
     return f"{text}; {size}probability {cause['probability']:.2f}{among}"
 
@@ -392,7 +385,7 @@ def _infer(
     best = int(made.probabilities[0].argmax())
 
     def interval(estimate: Estimate) -> tuple[float, float, float]:
-        value, low, high = (getattr(estimate, part)[0, best] for part in PARTS)
+        value, low, high = (getattr(estimate, part)[0, best] for part in ("value", "low", "high"))
         return float(value), float(low), float(high)
 
     onset = interval(made.onset)
