@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from numpy.typing import NDArray
 
-from retwin.monitor.store.updates import Asset, Update
+from retwin.monitor.store.updates import Asset
 
 KEPT = 600
 """Newest samples or trajectories that are kept for pages."""
@@ -77,7 +76,7 @@ class Recent:
     evidence: NDArray
 
 
-class Machine(ABC, Generic[Watching]):
+class Machine(Generic[Watching]):
     """A watched machine; its streams or trajectories are those of a class of its own.
 
     Parameters
@@ -127,14 +126,6 @@ class Machine(ABC, Generic[Watching]):
     def impossible(self) -> str:
         """Which channels have had impossible values; "" for none."""
         return ""
-
-    @abstractmethod
-    def recent(self) -> Recent:
-        """The newest samples, or scores of the newest trajectories."""
-
-    @abstractmethod
-    def update(self) -> Update | None:
-        """What is not stored yet, beside the entries; None for nothing."""
 
     def committed(self) -> None:
         """Everything is stored."""

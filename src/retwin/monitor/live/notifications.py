@@ -12,7 +12,6 @@ import json
 import os
 import threading
 import warnings
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, time
@@ -153,9 +152,9 @@ class Notifications:
         self._file = store.folder / FILE
         self._sent = _read(self._file)
         self._lock, self._stop = threading.Lock(), threading.Event()
-        newest = deque(store.log(), maxlen=1)
+        last = store.last
         for each in receivers:
-            self._sent.setdefault(each.name, newest[0].sequence if newest else -1)
+            self._sent.setdefault(each.name, last.sequence if last else -1)
         self._write()
         self._threads = [
             threading.Thread(target=self._run, args=(each,), name=f"notify {each.name}")
