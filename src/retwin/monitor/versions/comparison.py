@@ -110,10 +110,8 @@ def _of_samples(store: Store, twin: str, watching: Sequence[Any]) -> Scored:
         if seen[0].events:  # an alarm that was not raised when the samples came, after another one
             continue
         known = np.where(np.isfinite(seen[0].score) & np.isfinite(seen[1].score), measured, np.nan)
-        unit = np.nanstd(measured, axis=1, keepdims=True)
-        unit = np.where(unit > 0, unit, 1.0)
         found = [crps_normal(known, each.mean, each.deviation) for each in seen[:2]]
-        scores.append([_mean((each / unit)[0]) for each in found])
+        scores.append([_mean(each[0] / _deviation(measured[0])) for each in found])
         alarms += [len(each.events) for each in seen]
     expected = f"at least {2 * MIN_SAMPLES} without an alarm, of one asset"
     require(scores, "samples", expected=expected, got="fewer", remedy=LATER)
@@ -137,7 +135,8 @@ def _of_trajectories(store: Store, twin: str, watching: Sequence[Any]) -> Scored
     every = [each for part in machines for each in part]
     what = "healthy ones that are stored, of all machines together"
     at_least("trajectories", every, MIN_TRAJECTORIES, what, remedy=LATER)
-    unit = _deviation(every)
+    outputs = [np.where(each.mask, each.observed, np.nan)[0] for each in every]
+    unit = _deviation(np.concatenate(outputs).astype(float))
     twins = [_predicting(each) for each in watching[:2]]
     length = len(every) // BLOCKS
     scores: list[NDArray] = []
@@ -229,12 +228,11 @@ def _predicting(monitor: TrajectoryMonitor) -> Twin:
     return own.twin
 
 
-def _deviation(records: list[Trajectories]) -> NDArray:
-    """The standard deviation (d_y,) of what was measured of each output; 1 for a constant one."""
-    measured = np.concatenate([np.where(each.mask, each.observed, np.nan)[0] for each in records])
+def _deviation(measured: NDArray) -> NDArray:
+    """The standard deviation (d_y,) of each output (T, d_y); 1 for one that is constant."""
     seen = np.isfinite(measured).any(axis=0)
     found = np.ones(measured.shape[1])
-    found[seen] = np.nanstd(measured[:, seen].astype(float), axis=0)
+    found[seen] = np.nanstd(measured[:, seen], axis=0)
     return np.where(found > 0, found, 1.0)
 
 
