@@ -532,8 +532,7 @@ def found_cause(
         record,
         alarms,
         faults,
-        current=current,
-        unexplained=unexplained,
+        current=(current, unexplained),
     )
     if found is not None:
         found |= vars(made)

@@ -212,16 +212,9 @@ class Explanations:
         record = record_of(monitor.twin, values)
         *earlier, newest = [_alarm(each.data, int(times[0]), period) for each in entries]
         alarms = [*earlier, replace(newest, sample=record.steps - 1)]
-        current, unexplained = self._current.get((name, _event(last)), ("", 0.0))
-        cause = find_cause(
-            monitor.twin,
-            record,
-            alarms,
-            self.causes(twin, monitor),
-            current=current,
-            unexplained=unexplained,
-            known_start=False,
-        )
+        has, causes = self._current.get((name, _event(last)), ("", 0.0)), self.causes(twin, monitor)
+        given = monitor.twin, record, alarms, causes
+        cause = find_cause(*given, current=has, known_start=False)
         first, ends = int(times[0]), (cause.size, cause.onset)
         size, onset = ([each if np.isfinite(each) else None for each in end] for end in ends)
         moments = [None if each is None else first + round(each * SECOND) for each in onset]

@@ -254,7 +254,7 @@ def find_causes(
     whole("before", before, at_least=MIN_WINDOW)
     ids, found = record.ids.tolist(), list[Cause]()
     newest, inferred = dict[str, Alarm](), dict[tuple[str, int], list[Alarm]]()
-    current, latest = dict[tuple[str, int], Cause](), dict[tuple[str, int], Cause]()
+    current, latest = dict[tuple[str, int], tuple[str, float]](), dict[tuple[str, int], Cause]()
     for number, alarm in enumerate(alarms):
         if progress is not None:
             progress(number / len(alarms))
@@ -271,19 +271,14 @@ def find_causes(
         newest[alarm.trajectory] = alarm
         if is_due([each.sample for each in known if each.event == alarm.event], alarm.sample):
             known.append(alarm)
-            latest[event] = find_cause(
-                twin,
-                record[[ids.index(alarm.trajectory)]],
-                known,
-                faults,
-                before,
-                current=current[event].name if event in current else "",
-                unexplained=current[event].unknown if event in current else 0.0,
-                known_start=known_start,
+            own, has = record[[ids.index(alarm.trajectory)]], current.get(event, ("", 0.0))
+            cause = find_cause(
+                twin, own, known, faults, before, current=has, known_start=known_start
             )
-            if not latest[event].same or latest[event].name == current[event].name:
-                current[event] = latest[event]
-            found.append(latest[event])
+            latest[event] = cause
+            if not cause.same or cause.name == has[0]:
+                current[event] = cause.name, cause.unknown
+            found.append(cause)
         else:
             found.append(replace(latest[event], alarm=alarm, same=True))
     return found
@@ -315,8 +310,7 @@ def find_cause(
     faults: Mapping[str, Fault | None],
     before: int = BEFORE,
     *,
-    current: str = "",
-    unexplained: float = 0.0,
+    current: tuple[str, float] = ("", 0.0),
     known_start: bool = True,
 ) -> Cause:
     """The cause of the last of a trajectory's alarms, see `find_causes`.
@@ -330,11 +324,10 @@ def find_cause(
     alarms : sequence of Alarm
         The newest one before the event, if any, and those of the event at which its cause is
         inferred.
-    current : str
-        The cause that the event has; "" for none.
-    unexplained : float
-        Probability that there was something besides. It is also that of a cause which explains
-        the newest samples alone: in few of them each cause seems to.
+    current : tuple of str and float
+        The cause that the event has, "" for none, and the probability that there was something
+        besides. It is also that of a cause which explains the newest samples alone: in few of them
+        each cause seems to.
 
     """
     alarm, own = alarms[-1], [each for each in alarms if each.event == alarms[-1].event]
@@ -355,8 +348,8 @@ def find_cause(
     whole = infer(start) if alarm.sample - opening <= before else None
     begin = max(0, own[-2].sample + 1, alarm.sample - before)
     cause = whole if whole is not None and likely(whole) else infer(begin)
-    same = cause.name in (current, HEALTHY) or not likely(cause)
-    known = faults.get(current)
+    same = cause.name in (current[0], HEALTHY) or not likely(cause)
+    known = faults.get(current[0])
     if not same and isinstance(known, TimedFault):
         both = known, faults[cause.name]
         window = max(start, alarm.sample - EVENT), begin, alarm
@@ -364,7 +357,7 @@ def find_cause(
     if whole is not None and same:
         cause = whole
     elif cause is not whole:
-        cause = replace(cause, unknown=max(cause.unknown, unexplained))
+        cause = replace(cause, unknown=max(cause.unknown, current[1]))
     return replace(cause, same=same)
 
 

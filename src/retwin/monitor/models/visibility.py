@@ -78,7 +78,8 @@ def visible_sizes(
             progress(number / len(faults))
         if not isinstance(fault, TimedFault | Stuck):
             continue
-        largest = _largest(fault)
+        ends = np.atleast_1d(fault.size).tolist() if isinstance(fault, SizedFault) else []
+        largest = max(ends, key=abs, default=None)
         sizes = [None] if largest is None else [largest / 2**i for i in range(HALVINGS + 1)]
         best, share = None, _share(monitor, windows, fault, sizes[0])
         if share >= SHARE:
@@ -137,13 +138,6 @@ def _windows(monitor: Monitor, healthy: Trajectories) -> _Windows:
     even = np.linspace(0, len(starts) - 1, min(ONSETS, len(starts)))
     chosen = np.array(starts)[even.round().astype(int)]
     return _Windows(healthy, chosen[:, 0], chosen[:, 1], lead, steps)
-
-
-def _largest(fault: TimedFault | Stuck) -> float | None:
-    """The size of a fault that is farthest from 0."""
-    if not isinstance(fault, SizedFault):
-        return None
-    return float(max(np.atleast_1d(fault.size), key=abs))
 
 
 def _share(
