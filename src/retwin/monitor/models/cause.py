@@ -16,7 +16,7 @@ from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.inversion.fault_evidence import FaultEvidence
 from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.monitor.models.watched import Alarm
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.twins.faults.actuator_faults import Fault, ends_of
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
@@ -255,9 +255,7 @@ def find_causes(
     ids, found = record.ids.tolist(), list[Cause]()
     newest, inferred = dict[str, Alarm](), dict[tuple[str, int], list[Alarm]]()
     current, latest = dict[tuple[str, int], tuple[str, float]](), dict[tuple[str, int], Cause]()
-    for number, alarm in enumerate(alarms):
-        if progress is not None:
-            progress(number / len(alarms))
+    for alarm in tracked(alarms, len(alarms), progress):
         require(
             alarm.trajectory in ids and alarm.sample < record.steps,
             "alarms",
