@@ -36,9 +36,6 @@ Faults = Callable[[str], "Mapping[str, Fault | None] | None"]
 """The known faults of a twin by its name; None for any change."""
 
 
-NONE: Mapping[int, dict[str, Any]] = {}
-
-
 class _Turns(queue.Queue["list[Entry] | None"]):
     """Alarms that wait, each after those that it is explained with; None ends.
 
@@ -140,11 +137,9 @@ class Explanations:
         alarms = [each for each in entries if each.kind == "alarm"]
         if alarms and not self._closed.is_set():
             with self._taking:
-                self._take(each for each in alarms if each.sequence > self._last)
+                self._take((each for each in alarms if each.sequence > self._last), {})
 
-    def _take(
-        self, alarms: Iterable[Entry], explained: Mapping[int, dict[str, Any]] = NONE
-    ) -> None:
+    def _take(self, alarms: Iterable[Entry], explained: Mapping[int, dict[str, Any]]) -> None:
         """Queue the alarms at which a cause is due, each after those that it is inferred with."""
         for entry in alarms:
             data, asset = entry.data, entry.data["asset"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import os
 import threading
 import time
 from abc import abstractmethod
@@ -24,7 +23,7 @@ from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.layouts import layout_of
 from retwin.monitor.sources.source import Source
-from retwin.monitor.sources.tables import GrowingTable, Layout
+from retwin.monitor.sources.tables import GrowingTable, Layout, state_of
 from retwin.monitor.store.samples import LONGEST, SECOND, Samples, Trajectory, places
 from retwin.monitor.store.updates import EARLIEST
 from retwin.twins.twin import check_channels
@@ -201,17 +200,15 @@ class TrajectoryFolder(Files[Recorded]):
             self._known[asset, path].read = now
 
     def _complete(self, asset: str, path: str) -> tuple[int, ...] | None:
-        """What a file is, if it is complete: its number, size and time of change in ns."""
+        """What a file is, see `state_of`, if it is complete."""
         try:
-            about = os.stat(path)
+            now, clock = state_of(path), time.monotonic()
         except OSError:
             return None  # it was removed meanwhile
-        now = (about.st_ino, about.st_size, about.st_mtime_ns)
-        clock = time.monotonic()
         file = self._known.setdefault((asset, path), _File(now, clock))
         if file.state != now:
             file.state, file.since = now, clock
-        age = max(clock - file.since, time.time() - about.st_mtime)
+        age = max(clock - file.since, time.time() - now[-1] / SECOND)
         return now if age >= self._settings.settle else None
 
     def _trajectories(self, asset: str, path: Path, changed: int) -> list[Trajectory]:

@@ -201,11 +201,9 @@ class OpcUa(Source):
                 found = [
                     Samples(asset, *each.take(now)) for asset, each in self._assemblies.items()
                 ]
-                new = [each for each in found if len(each.times)]
-                if new:
-                    futures = [gate.send(each) for each in new]
-                    for samples, future in zip(new, futures, strict=True):
-                        await asyncio.to_thread(self.stored, gate, samples, stop, future)
+                sent = [(each, gate.send(each)) for each in found if len(each.times)]
+                for samples, future in sent:
+                    await asyncio.to_thread(self.stored, gate, samples, stop, future)
 
     async def _client(self) -> Any:
         own = self._settings

@@ -107,9 +107,8 @@ class Layout:
                 bad += [f"{str(each)[:80]!r} in {table.place}, column {name!r}" for each in text]
                 good &= ~odd
         means = [mean_of([found[each] for each in own], table.place) for own in self.columns]
-        columns = [each.values for each in means]
-        for at, (channel, mean) in enumerate(zip(self.channels, means, strict=False)):
-            columns[at] = _in_unit_of(channel, mean, table.place)
+        pairs = zip(self.channels, means, strict=False)
+        columns = [_in_unit_of(*pair, table.place) for pair in pairs] or [e.values for e in means]
         values = np.stack(columns, axis=1)[good]
         times = times[good[kept]] + self.offset
         self._mask(times, values, since)
@@ -159,6 +158,12 @@ class Rows:
     end: Any
 
 
+def state_of(path: str | Path) -> tuple[int, int, int]:
+    """The number of a file, its size, and the time of its change in ns."""
+    about = os.stat(path)
+    return about.st_ino, about.st_size, about.st_mtime_ns
+
+
 class GrowingTable(ABC):
     """A file of rows that may grow, or be replaced by another one of that name.
 
@@ -180,10 +185,8 @@ class GrowingTable(ABC):
 
     def changed(self) -> bool:
         """Whether the file was written to, or replaced, since this was last called."""
-        about = os.stat(self.path)
-        now = (about.st_ino, about.st_size, about.st_mtime_ns)
-        before, self._seen = self._seen, now
-        return before != now
+        before, self._seen = self._seen, state_of(self.path)
+        return before != self._seen
 
     def rows(self) -> Iterator[Rows]:
         """New rows part by part; after each, set `place` to its end to have read it.

@@ -180,9 +180,7 @@ def _healthy_samples(store: Store, twin: str, monitor: Monitor) -> Iterator[NDAr
         ends = np.searchsorted(times, sorted(alarms.get(name, [])))
         ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))
         first = int(np.argmax(np.diff(ends))) if len(ends) > 1 else 0
-        part = rows[ends[first] : ends[first + 1] - BEFORE]
-        known = np.isfinite(part[:, : len(monitor.twin.inputs)]).all(axis=1)
-        yield part[int(np.argmax(known)) :] if known.any() else part[:0]
+        yield rows[ends[first] : ends[first + 1] - BEFORE]
 
 
 def _tested(monitor: TrajectoryMonitor, machines: list[list[Trajectories]]) -> FalseAlarmTest:

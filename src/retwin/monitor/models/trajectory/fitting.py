@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from retwin.checks import finite, instance, require
+from retwin.checks import finite, instance, nothing, require
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.monitor.detect.offsets import biases, fit_offsets
@@ -72,7 +72,10 @@ def fit_trajectory_monitor(
     diagnoser = checked(checked(diagnoser).with_faults(causes or {}))
     instance("healthy", healthy, Trajectories, remedy="load recorded ones")
     finite("alpha", alpha, at_least=1e-12, at_most=0.5)
-    _check_labels(diagnoser, healthy)
+    allowed = {HEALTHY, *(name for name, fault in diagnoser.faults.items() if fault is None)}
+    faulty = [f"some labelled {name}" for name in sorted(healthy.known_labels - allowed)[:3]]
+    expected = f"trajectories without labels, or labelled {' or '.join(sorted(allowed))}"
+    nothing("healthy", faulty, expected, remedy="leave these out")
     length = healthy.steps / healthy.rate
     arl = false_alarms(false_alarms_at_most, 1 / length)
     found = compared(diagnoser, healthy, progress)
@@ -114,17 +117,4 @@ def fit_trajectory_monitor(
         expected="trajectories that the diagnoser takes for healthy ones",
         got=f"some that look like {likely}",
         remedy="leave out faulty ones, or calibrate the twin on more healthy trajectories",
-    )
-
-
-def _check_labels(diagnoser: Inversion, healthy: Trajectories) -> None:
-    """Refuse trajectories that are labelled as faulty ones."""
-    allowed = {HEALTHY, *(name for name, fault in diagnoser.faults.items() if fault is None)}
-    faulty = sorted(healthy.known_labels - allowed)
-    require(
-        not faulty,
-        "healthy",
-        expected=f"trajectories without labels, or labelled {' or '.join(sorted(allowed))}",
-        got=f"some labelled {', '.join(faulty[:3])}",
-        remedy="leave these out",
     )
