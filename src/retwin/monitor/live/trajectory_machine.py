@@ -176,11 +176,6 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         """Scores of the newest trajectories, which are standard Gaussian for a healthy machine."""
         times, score, evidence = np.array(self._recent, dtype=object).reshape(-1, 3).T
         values = score.astype(float)[:, None]
-        return Recent(
-            times.astype(np.int64),
-            np.zeros((len(times), 0)),
-            values,
-            np.zeros_like(values),
-            np.ones_like(values),
-            evidence.astype(float),
-        )
+        whole, commands = times.astype(np.int64), values[:, :0]
+        standard = np.zeros_like(values), np.ones_like(values)
+        return Recent(whole, commands, values, *standard, evidence.astype(float))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from retwin.checks import given, require
-from retwin.data.trajectories import HEALTHY, Channels
+from retwin.data.trajectories import HEALTHY
 from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.live import Live
 from retwin.monitor.live.machine import AssetStatus, Recent
@@ -96,7 +96,8 @@ class Views:
         got, remedy = repr(name)[:80], "see /assets"
         status = given("asset", found, "one that is watched", got=got, remedy=remedy)
         monitor, twins = self._live.monitor(name), self._twins()
-        recent = self._live.recent(name)
+        scores, recent = isinstance(monitor, TrajectoryMonitor), self._live.recent(name)
+        names = ([], [("score", "1")]) if scores else _channels(monitor.twin)
         times = recent.times / SECOND
         new = slice(0 if after is None else int(np.searchsorted(times, after, "right")), None)
         return {
@@ -105,14 +106,14 @@ class Views:
             "run_length": getattr(monitor, "run_length", monitor.arl),
             "tried": tried(monitor),
             "rate": pace(monitor),
-            "kind": "scores" if isinstance(monitor, TrajectoryMonitor) else "samples",
+            "kind": "scores" if scores else "samples",
             "promise": {name: str(each) for name, each in monitor.promises.items()},
             "events": [
                 self._explained(each, twins) if each["kind"] == "alarm" else each
                 for each in self.journal.events(name)
             ],
             "evidence": recent.evidence[new].tolist(),
-            **_drawn(*_channels(monitor), recent, new),
+            **_drawn(*names, recent, new),
         }
 
     def around(self, sequence: int) -> dict[str, Any]:
@@ -141,9 +142,8 @@ class Views:
                 mean = monitor.twin.simulate(commands[None], seed=0).nominal[0]
         recent = Recent(times, commands, measured, mean, deviation, np.zeros(len(times)))
         shown = 0 if whole else int(np.searchsorted(times, moment - round(SHOWN * period)))
-        names = _named(monitor.twin.inputs), _named(monitor.twin.outputs)
-        kind = "trajectory" if whole else "samples"
-        return {"kind": kind, **_drawn(*names, recent, slice(shown, None))}
+        kind, drawn = "trajectory" if whole else "samples", slice(shown, None)
+        return {"kind": kind, **_drawn(*_channels(monitor.twin), recent, drawn)}
 
     def alarms(self, asset: str | None, before: int | None, limit: int) -> dict[str, Any]:
         """A page of alarms, the newest first."""
@@ -224,11 +224,10 @@ def tried(monitor: AnyMonitor) -> dict[str, Any] | None:
     return {**counts, "run_length": found.run_length}
 
 
-def _channels(monitor: AnyMonitor) -> tuple[Named, Named]:
-    """The commands and outputs that are drawn; of trajectories their score alone."""
-    if isinstance(monitor, TrajectoryMonitor):
-        return [], [("score", "1")]
-    return _named(monitor.twin.inputs), _named(monitor.twin.outputs)
+def _channels(twin: Any) -> tuple[Named, Named]:
+    """The commands and outputs."""
+    inputs, outputs = (zip(e.names, e.units, strict=True) for e in (twin.inputs, twin.outputs))
+    return list(inputs), list(outputs)
 
 
 def _drawn(inputs: Named, outputs: Named, recent: Recent, part: slice) -> dict[str, Any]:
@@ -250,10 +249,6 @@ SHARED = ("asset", "twin", "version", "event", "rate", "impossible", "counts")
 """What the page shows of a status as it is."""
 ORDER = ("alarm", "void", "impossible", "stopped", "rate", "outside", "ok")
 """The states of assets, the worst first."""
-
-
-def _named(channels: Channels) -> Named:
-    return list(zip(channels.names, channels.units, strict=True))
 
 
 SENTENCES: Mapping[type, Callable[[Any, AnyMonitor], str]] = {

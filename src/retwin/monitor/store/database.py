@@ -278,7 +278,7 @@ def present(connection: Any, key: int, times: NDArray) -> NDArray:
 def last_entry(connection: Any) -> Entry | None:
     """The newest entry of the log; None if it has none."""
     row = connection.execute(log.select().order_by(log.c.sequence.desc()).limit(1)).one_or_none()
-    return row and Entry(row.sequence, row.kind, row.text, row.previous, row.hash)
+    return row and Entry(*row)
 
 
 def _address(url: str) -> Any:

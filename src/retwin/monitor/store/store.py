@@ -271,8 +271,7 @@ class Store:
         """
         chosen = log.select() if kind is None else log.select().where(log.c.kind == kind)
         for rows in self._parts(chosen, log.c.sequence, after):
-            for row in rows:
-                yield Entry(row.sequence, row.kind, row.text, row.previous, row.hash)
+            yield from (Entry(*row) for row in rows)
 
     def _parts(
         self, chosen: sa.Select, key: sa.Column, last: int | None

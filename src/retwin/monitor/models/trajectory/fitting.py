@@ -98,19 +98,10 @@ def fit_trajectory_monitor(
         factor = factors(ratio, kappa).mean(axis=1)
         bound = factor.mean() + CERTAIN * factor.std(ddof=1) / np.sqrt(len(factor))
         if bound <= 1:
-            return TrajectoryMonitor(
-                diagnoser,
-                scores,
-                slack,
-                float(kappa),
-                arl,
-                length,
-                np.stack([count.min(axis=0), count.max(axis=0)]).astype(float),
-                offsets,
-                float(alpha),
-                int(used.sum()),
-                len(healthy),
-            )
+            measured = np.stack([count.min(axis=0), count.max(axis=0)]).astype(float)
+            about = float(kappa), arl, length, measured, offsets, float(alpha)
+            counts = int(used.sum()), len(healthy)
+            return TrajectoryMonitor(diagnoser, scores, slack, *about, *counts)
     likely = alternatives(diagnoser)[int(np.median(ratio, axis=0).argmax())]
     raise InputError(
         "healthy",
