@@ -37,7 +37,7 @@ from retwin.monitor.program import _offer
 from retwin.monitor.settings import TwinSettings
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.gridded import gridded
-from retwin.monitor.store.updates import Asset, Update
+from retwin.monitor.store.samples import Asset, Update
 from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics
 

@@ -28,11 +28,9 @@ from retwin.monitor.models.monitor import BEYOND, Monitor
 from retwin.monitor.models.trajectory import monitor as trajectories
 from retwin.monitor.models.trajectory.evidence import Compared
 from retwin.monitor.models.trajectory.monitor import COMPARABLE, SHOWN, TrajectoryMonitor
-from retwin.monitor.models.visible import SHARE, Visible
-from retwin.monitor.models.watched import Alarm, Ending, Part
+from retwin.monitor.models.watched import SHARE, Alarm, Ending, Part, Visible
 from retwin.monitor.server import journal, views
-from retwin.monitor.store.samples import Samples, Trajectory
-from retwin.monitor.store.updates import Asset
+from retwin.monitor.store.samples import Asset, Samples, Trajectory
 from retwin.monitor.versions import comparison
 from retwin.monitor.versions.decision import MIN_SAMPLES, decide
 from retwin.monitor.versions.recalibration import _events, _parts

@@ -37,11 +37,10 @@ from retwin.monitor.settings import (
     secret,
 )
 from retwin.monitor.sources.folder import Folder, Recorded, TrajectoryFolder
-from retwin.monitor.sources.layouts import layout_of, mapped_layout
 from retwin.monitor.sources.mqtt import Mqtt
 from retwin.monitor.sources.opcua import OpcUa
 from retwin.monitor.sources.source import Source
-from retwin.monitor.sources.tables import Layout
+from retwin.monitor.sources.tables import Layout, layout_of, mapped_layout
 from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 from retwin.serialisation.files import sha256

@@ -23,9 +23,8 @@ from retwin.monitor.models.monitor_state import Layout
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.gridded import Limits
-from retwin.monitor.store.samples import SECOND, Samples, Trajectory
+from retwin.monitor.store.samples import LATEST, SECOND, Asset, Samples, Trajectory, one_asset
 from retwin.monitor.store.store import Store
-from retwin.monitor.store.updates import LATEST, Asset, one_asset
 from retwin.monitor.versions.registry import Registry
 
 MAX_WAIT = 60.0

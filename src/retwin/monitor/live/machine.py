@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar
 
 from numpy.typing import NDArray
 
-from retwin.monitor.store.updates import Asset
+from retwin.monitor.store.samples import Asset
 
 KEPT = 600
 """Newest samples or trajectories that are kept for pages."""

@@ -18,8 +18,7 @@ from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.monitor_state import Layout
 from retwin.monitor.models.watched import Watched
 from retwin.monitor.store.gridded import Limits
-from retwin.monitor.store.samples import SECOND, Samples
-from retwin.monitor.store.updates import EARLIEST, Asset, Update
+from retwin.monitor.store.samples import EARLIEST, SECOND, Asset, Samples, Update
 
 ALARM = ("sample", "output", "change", "evidence", "machine")
 """What the log has of an alarm, beside its time and that of its event."""

@@ -19,8 +19,7 @@ from retwin.monitor.models.cause import cause_data
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.models.trajectory.state import REMARKS, TrajectoryState, WatchedTrajectories
 from retwin.monitor.store.gridded import record_of
-from retwin.monitor.store.samples import Samples, Trajectory
-from retwin.monitor.store.updates import Asset, Update
+from retwin.monitor.store.samples import Asset, Samples, Trajectory, Update
 
 UNUSUAL = ("unmeasured", "unranked", "implausible")
 """What trajectories may be that is an event of the log when it begins and when it ends. Commands

@@ -23,11 +23,11 @@ from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.gate import Gate
 from retwin.monitor.live.live import Live
 from retwin.monitor.live.machine import Received
-from retwin.monitor.server.comparison import Comparisons
 from retwin.monitor.server.guard import RequestGuard
 from retwin.monitor.server.metrics import Metrics
 from retwin.monitor.server.views import Views
 from retwin.monitor.store.samples import parse
+from retwin.monitor.versions.comparison import Comparisons
 from retwin.monitor.versions.decision import Decision
 from retwin.monitor.versions.registry import Registry
 from retwin.report.figures.style import CHROME, PALETTE

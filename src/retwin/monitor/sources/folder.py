@@ -21,11 +21,9 @@ from retwin.errors import InputError
 from retwin.monitor.live.gate import Gate
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.settings import FolderSource
-from retwin.monitor.sources.layouts import layout_of
 from retwin.monitor.sources.source import Source
-from retwin.monitor.sources.tables import GrowingTable, Layout, state_of
-from retwin.monitor.store.samples import LONGEST, SECOND, Samples, Trajectory, places
-from retwin.monitor.store.updates import EARLIEST
+from retwin.monitor.sources.tables import GrowingTable, Layout, layout_of, state_of
+from retwin.monitor.store.samples import EARLIEST, LONGEST, SECOND, Samples, Trajectory, places
 from retwin.twins.twin import check_channels
 
 OVERLAP = 60 * 10**9

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from retwin.arrays import held
 from retwin.checks import one_of, require
 from retwin.data.trajectories import Trajectories
-from retwin.monitor.store.samples import SECOND, places
+from retwin.monitor.store.samples import EARLIEST, SECOND, places
 from retwin.monitor.store.store import Store
-from retwin.monitor.store.updates import EARLIEST
 from retwin.update.dynamics.twin import DynamicsTwin
 
 

@@ -28,7 +28,7 @@ from retwin.monitor.store.database import (
     samples,
     states,
 )
-from retwin.monitor.store.updates import (
+from retwin.monitor.store.samples import (
     EARLIEST,
     LATEST,
     WORD,

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import threading
+import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import agree, at_least, given, require
+from retwin.checks import agree, at_least, at_most, given, require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.inversion.trajectories import InversionDiagnoser
 from retwin.evaluation.fidelity.simulation import simulate_records
@@ -37,6 +41,9 @@ TRAJECTORIES_BEFORE = 10
 """Trajectories before an alarm that are left out: its cause may already act in them."""
 DRAWS = 200
 """Simulations of each trajectory; the CRPS has no bias by their number."""
+FRESH, PATIENCE, QUEUE = 60.0, 20.0, 16
+"""A comparison is kept for so many seconds, or for so many times as long as it took, whichever is
+longer; and comparisons that may be made or kept."""
 LATER = "compare the versions later"
 """What to do where too little is stored."""
 KINDS: Mapping[type, str] = {Monitor: "samples", TrajectoryMonitor: "trajectories"}
@@ -179,7 +186,7 @@ def _healthy_samples(store: Store, twin: str, monitor: Monitor) -> Iterator[NDAr
         times, rows = gridded(store, name, monitor.twin, first, newest)
         ends = np.searchsorted(times, sorted(alarms.get(name, [])))
         ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))
-        first = int(np.argmax(np.diff(ends))) if len(ends) > 1 else 0
+        first = int(np.argmax(np.diff(ends)))
         yield rows[ends[first] : ends[first + 1] - BEFORE]
 
 
@@ -240,3 +247,47 @@ def _crps(twin: Twin, record: Trajectories, unit: NDArray) -> float:
         warnings.simplefilter("ignore")
         found = simulate_records(twin, record, draws=DRAWS, seed=0).crps[0] / unit
     return float(found[record.mask[0]].mean())
+
+
+@dataclass(eq=False)
+class _Made:
+    """A comparison, and until when it is kept once it is done."""
+
+    future: Future[Decision]
+    begun: float = field(default_factory=time.monotonic)
+    until: float = float("inf")
+
+    def done(self, _: object) -> None:
+        """Note that it is done."""
+        now = time.monotonic()
+        self.until = now + max(FRESH, PATIENCE * (now - self.begun))
+
+
+class Comparisons:
+    """Comparisons in a thread of their own, one after the other, each kept for a while.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._worker = ThreadPoolExecutor(1, "comparison")
+        self._made: dict[tuple[str, int], _Made] = {}
+        self._lock = threading.Lock()
+
+    def of(self, twin: str, number: int) -> Future[Decision]:
+        """The comparison of a version with the active one."""
+        key, now = (twin, number), time.monotonic()
+        with self._lock:
+            self._made = {each: made for each, made in self._made.items() if now < made.until}
+            if key not in self._made:
+                count = len(self._made) + 1
+                at_most("comparison", count, QUEUE, "at a time", remedy="wait for a minute")
+                made = _Made(self._worker.submit(compare, self._store, twin, number))
+                self._made[key] = made
+                made.future.add_done_callback(made.done)
+            return self._made[key].future
