@@ -115,17 +115,14 @@ def fit(
     if updated is None and system is None and mapping is None and tables:
         records = [read_signals(healthy, max_bytes)]
     else:
-        records = [
-            _healthy(reading(file, system or _named(updated), part="calibration"), file)
-            for file in healthy
-        ]
+        own = partial(reading, case=system or _named(updated), part="calibration")
+        records = [_healthy(own(file), file) for file in healthy]
     with bar("calibrate") as show:
         show("monitor", 0.0)
         given = Trajectories.concatenate(records)
         checked = check_with_twin(known, given)
-        made = fit_monitor(
-            known, given, false_alarms, lasting=3600.0 if lasting is None else lasting
-        )
+        more = {} if lasting is None else {"lasting": lasting}
+        made = fit_monitor(known, given, false_alarms, **more)
         show("faults that are seen", 0.5)
         causes = possible_causes(made.twin, system and system.alarm_causes)
         seen = partial(show, "faults that are seen")
@@ -218,7 +215,7 @@ def _fit_trajectories(
             Trajectories.concatenate(records),
             false_alarms,
             causes=system.causes if system else None,
-            progress=lambda share: show("diagnose", share),
+            progress=partial(show, "diagnose"),
         )
     made.save(out)
     about = {"saved": str(out), "arl": made.arl, "kappa": made.kappa, "promise": made.promise}
@@ -239,9 +236,7 @@ def _replay_trajectories(
     for file in logs:
         record = reading(file, system)
         with bar("diagnose") as show:
-            state, watched = made.watch(
-                record, state, progress=lambda share, name=file.name: show(name, share)
-            )
+            state, watched = made.watch(record, state, progress=partial(show, file.name))
         rows += [
             (file.name, each.trajectory, str(each.number), each.name) for each in watched.alarms
         ]
@@ -438,9 +433,7 @@ def _causes(
         return []
     faults = possible_causes(monitor.twin, system and system.alarm_causes)
     with bar("explain") as show:
-        return find_causes(
-            monitor.twin, record, alarms, faults, progress=lambda share: show("alarms", share)
-        )
+        return find_causes(monitor.twin, record, alarms, faults, progress=partial(show, "alarms"))
 
 
 def _event_rows(
