@@ -204,13 +204,13 @@ class Explanations:
         times, values = gridded(store, name, monitor.twin, begin - half, last["time"] + half)
         remedy = "store more of them: see max_samples"
         at_least("samples", times, 2, "before the alarm in the store", remedy=remedy)
-        record = record_of(monitor.twin, values)
-        *earlier, newest = [_alarm(each.data, int(times[0]), period) for each in entries]
+        record, first = record_of(monitor.twin, values), int(times[0])
+        *earlier, newest = [_alarm(each.data, first, period) for each in entries]
         alarms = [*earlier, replace(newest, sample=record.steps - 1)]
         has, causes = self._current.get((name, _event(last)), ("", 0.0)), self.causes(twin, monitor)
         given = monitor.twin, record, alarms, causes
         cause = find_cause(*given, current=has, known_start=False)
-        first, ends = int(times[0]), (cause.size, cause.onset)
+        ends = cause.size, cause.onset
         size, onset = ([each if np.isfinite(each) else None for each in end] for end in ends)
         moments = [None if each is None else first + round(each * SECOND) for each in onset]
         shares = cause.probability, cause.unknown, cause.probabilities

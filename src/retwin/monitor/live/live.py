@@ -226,13 +226,9 @@ class Live:
         require(who.strip(), "who", expected="who has seen it", got=repr(who), remedy=remedy)
         after = whole("sequence", sequence, at_least=0) - 1
         entry = next(iter(self.store.log("alarm", after=after)), None)
-        require(
-            entry is not None and entry.sequence == sequence,
-            "sequence",
-            expected="that of an alarm in the log",
-            got=sequence,
-            remedy="see the alarms",
-        )
+        known = entry if entry and entry.sequence == sequence else None
+        expected = "that of an alarm in the log"
+        given("sequence", known, expected, got=sequence, remedy="see the alarms")
         data = {"alarm": sequence, "who": who, "note": note, "at": self._clock()}
         self.log([("acknowledge", data)])
 
