@@ -210,22 +210,16 @@ class Monitor:
         """What is found in samples (n, T, ...) if none of the machines begins anew in them."""
         count, samples = measured.shape[:2]
         seen, learn = np.isfinite(measured), state.course.event < 0
-        predicted = [
-            online.step(own, commands, measured, seen, learn)
-            for online, own in zip(self._filters, state.filters, strict=True)
-        ]
-        pairs = zip(
-            *(
-                standardised(measured - mean, covariance, seen, self.resolution)
-                for _, mean, covariance in predicted
-            ),
-            strict=True,
-        )
+        models = zip(self._filters, state.filters, strict=True)
+        found = [online.step(own, commands, measured, seen, learn) for online, own in models]
+        filtered, means, covariances = zip(*found, strict=True)
+        predicted = zip(means, covariances, strict=True)
+        both = [standardised(measured - at, own, seen, self.resolution) for at, own in predicted]
+        pairs = zip(*both, strict=True)
         error, width = (by_stream(np.concatenate(each, axis=2)) for each in pairs)
         model, validity = self._streams(count)
         disturbance, error, scale = model.run(state.disturbance, error)
-        _, mean, covariance = predicted[0]
-        before, level = state.filters[0].commands[:, -1], np.nan_to_num(mean)
+        before, level = state.filters[0].commands[:, -1], np.nan_to_num(means[0])
         changes, noted = features(state.changes, before, commands, level, span_of(self.twin))
         shift, spread = (by_stream(each) for each in self.noise.run(noted))
         error, width = (error - shift) / spread, width / scale / spread
@@ -255,25 +249,19 @@ class Monitor:
         ended = rules.ends(state.course, total, end_evidence, counted) & ~alarm
         outside = self._outside(commands)
         changed = rules.changes(state.course, samples) & ~ended
-        filters = tuple(
-            finite_state(online, filtered)
-            for online, (filtered, _, _) in zip(self._filters, predicted, strict=True)
-        )
-        stays_finite = np.all(
-            [np.isfinite(each).all(axis=(1, 2)) for _, each, _ in predicted], axis=0
-        )
+        stays_finite = np.all([np.isfinite(each).all(axis=(1, 2)) for each in means], axis=0)
         after = replace(
             state,
-            filters=filters,
+            filters=tuple(map(finite_state, self._filters, filtered)),
             disturbance=disturbance,
             detector=detector,
             changes=changes,
             scale=sums,
             void=state.void | ~stays_finite,
         )
-        deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
+        deviation = np.sqrt(np.diagonal(covariances[0], axis1=2, axis2=3))
         flags = alarm, ended, changed, counted, outside
-        return Part(after, mean, deviation, low, high, evidence, total, end_evidence, *flags)
+        return Part(after, means[0], deviation, low, high, evidence, total, end_evidence, *flags)
 
     def _after(
         self,
