@@ -78,7 +78,7 @@ class StreamMachine(Machine[Monitor]):
         self._missing = np.full(asset.channels, np.nan)
         self._origin: int | None = None
         self._done = -1
-        self._pending: dict[int, tuple[int, NDArray]] = {}
+        self._pending: dict[int, NDArray] = {}
         self._farthest = -1
         self._rows: list[NDArray] = []
         self._work: deque[Work] = deque()
@@ -158,7 +158,7 @@ class StreamMachine(Machine[Monitor]):
         for moment, row in zip(times.tolist(), values, strict=True):
             place = self._place(moment)
             if place > self._done:
-                self._pending[place] = moment, row
+                self._pending[place] = row
                 self._farthest = max(self._farthest, place)
                 self.newest = max(self.newest or moment, moment)
 
@@ -282,8 +282,7 @@ class StreamMachine(Machine[Monitor]):
                 return "unknown"
             self._begin(moment)
         place = self._place(moment)
-        self._pending[place] = moment, row
-        self._new[moment] = row
+        self._pending[place] = self._new[moment] = row
         self._farthest = max(self._farthest, place)
         self.newest = moment if self.newest is None else max(self.newest, moment)
         self._late = 0
@@ -309,10 +308,8 @@ class StreamMachine(Machine[Monitor]):
         self._late += 1
         if self._late == BEHIND and self.newest is not None:
             behind = (self.newest - moment) / SECOND
-            text = (
-                f"samples are {behind:.6g} s behind the newest one and not used: a clock set back?"
-            )
-            self.log("event", self.newest, what="clock", text=text)
+            text = f"samples are {behind:.6g} s behind the newest one and not used"
+            self.log("event", self.newest, what="clock", text=f"{text}: a clock set back?")
         return "late"
 
     def _advance(self, wait: int) -> None:
@@ -322,7 +319,7 @@ class StreamMachine(Machine[Monitor]):
             found = self._pending.pop(place, None)
             if found is None and self._farthest - place < wait:
                 return
-            self._rows.append(self._measured(place, self._missing if found is None else found[1]))
+            self._rows.append(self._measured(place, self._missing if found is None else found))
             self._done = place
             self._checked_rate(place, missing=found is None)
 
