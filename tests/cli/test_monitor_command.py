@@ -61,28 +61,29 @@ def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:
     within = replace(later, probability=0.8, onset=(3.1, 3.0, 4.0))
     for more, text in (((later,), "0.25"), ((beside,), "0.2 "), ((within,), "0.2 ")):
         (row,) = _event_rows(watched, [found, *more], 1.0)  # type: ignore[arg-type]
-        assert row[-1].startswith(f"leaking from 2.0 s; size {text.strip()} 1/s")
+        assert row[-1][0].startswith(f"leaking from 2.0 s; size {text.strip()} 1/s")
     anew = replace(first, event=9, sample=9, time=9.0)
     both = SimpleNamespace(events=[first, anew], endings=[])
     same, other = replace(found, alarm=anew), replace(beside, alarm=anew, same=False)
     (row,) = _event_rows(both, [found, same], 1.0)  # type: ignore[arg-type]
     assert row[1:3] == ("3", "lasts")
-    assert row[-1].startswith("leaking from 2.0 s; size")
-    assert "again, or still, 1 time until 9 s, then leaking from 2.0 s" in row[-1]
+    assert row[-1][0].startswith("leaking from 2.0 s; size")
+    assert "again, or still, 1 time until 9 s, then leaking from 2.0 s" in row[-1][1]
     rows = _event_rows(both, [found, other], 1.0)  # type: ignore[arg-type]
-    assert [each[-1][:9] for each in rows] == ["leaking f", "weak pump"]
+    assert [each[-1][0][:9] for each in rows] == ["leaking f", "weak pump"]
     remark = SimpleNamespace(events=[replace(first, promised=False)], endings=[])
     (row,) = _event_rows(remark, [found], 1.0)  # type: ignore[arg-type]
     assert row[-2].startswith("remark: ")
-    assert row[-1].startswith("if it is a fault: leaking from 2.0 s")
+    assert row[-1][0].startswith("if it is a fault: leaking from 2.0 s")
     second = replace(within, name="weak pump", size=(-0.5, -0.6, -0.4), unit="", same=False)
     (row,) = _event_rows(watched, [found, second], 1.0)  # type: ignore[arg-type]
     newest = "weak pump from 3.1 s; size -0.5 (-0.6 to -0.4), probability 0.80"
-    assert row[-1].startswith(f"{newest}; before, by fewer samples: leaking from 2.0 s")
+    assert row[-1][0] == newest
+    assert row[-1][1].startswith("before, by fewer samples: leaking from 2.0 s")
     # What all samples say now is shown, also where it is not sure enough to replace the first.
     unsure = replace(second, same=True)
     (row,) = _event_rows(watched, [found, unsure], 1.0)  # type: ignore[arg-type]
-    assert row[-1].startswith(newest)
+    assert row[-1][0].startswith(newest)
 
 
 @pytest.mark.slow

@@ -20,8 +20,7 @@ from retwin.data.row_times import row_times
 from retwin.errors import InputError
 from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.folder import Folder
-from retwin.monitor.sources.layouts import layout_of, mapped_layout
-from retwin.monitor.sources.tables import CHUNK, Layout
+from retwin.monitor.sources.tables import CHUNK, Layout, layout_of, mapped_layout
 
 SECOND = 10**9
 CHANNELS = ("heater", "T1")

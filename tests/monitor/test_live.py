@@ -29,15 +29,15 @@ from retwin.monitor import (
     verify,
 )
 from retwin.monitor.live.explanations import _Turns
-from retwin.monitor.live.layout import Layout
 from retwin.monitor.live.machine import Counts
 from retwin.monitor.live.stream_machine import PLACES, StreamMachine
 from retwin.monitor.models.cause import is_due
+from retwin.monitor.models.monitor_state import Layout
 from retwin.monitor.program import _offer
 from retwin.monitor.settings import TwinSettings
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.gridded import gridded
-from retwin.monitor.store.updates import Asset, Update
+from retwin.monitor.store.samples import Asset, Update
 from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics
 
@@ -374,7 +374,7 @@ def test_the_earliest_and_the_latest_time_are_restarted_from(store: Store) -> No
 @pytest.mark.slow
 def test_samples_with_many_holes_are_taken_in_parts(store: Store, monitor: Monitor) -> None:
     asset = Asset("a", 2, {"twin": "tank"}, 1)
-    machine, counts = StreamMachine(asset, monitor, Layout(monitor), None), Counts()
+    machine, counts = StreamMachine(asset, monitor, Layout(monitor.start(1)), None), Counts()
     left = Samples("a", BEGIN + 3500 * SECOND * np.arange(50), np.ones((50, 2)))
     while len(left.times):
         left, places = machine.accept(left, BEGIN + 10**18, set(), counts), 0

@@ -30,7 +30,7 @@ from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.program import run
 from retwin.monitor.server import create_app, listening, serving
 from retwin.monitor.settings import FolderSource, read_settings
-from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
+from retwin.monitor.sources.folder import Recorded, TrajectoryFolder
 from retwin.monitor.store.samples import SECOND, Trajectory, parse
 from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics

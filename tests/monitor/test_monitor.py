@@ -337,7 +337,7 @@ def test_a_wrong_cause_is_replaced_by_the_one_that_explains_the_event(monitor: M
     alarms = [first, next(each for each in further if each.sample - first.sample > 10)]
     causes, other = possible_causes(monitor.twin), "pump: another effect"
     for current, same in ((other, False), ("drain changed", True)):
-        cause = find_cause(monitor.twin, leaking, alarms, causes, current=current)
+        cause = find_cause(monitor.twin, leaking, alarms, causes, current=(current, 0.0))
         assert (cause.name, cause.same, cause.unit) == ("drain changed", same, "1/s")
         assert cause.size[1] < 1.3 < cause.size[2]
     assert cause.onset[0] < first.time

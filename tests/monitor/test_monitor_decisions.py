@@ -18,23 +18,19 @@ from retwin.monitor.detect.events import CHANGED, FOLLOWS, Course
 from retwin.monitor.detect.promise import FalseAlarmTest
 from retwin.monitor.detect.scores import fit_scores
 from retwin.monitor.detect.slack import Slack
-from retwin.monitor.live.machine import Counts
-from retwin.monitor.live.status import AssetStatus
+from retwin.monitor.live.machine import AssetStatus, Counts
 from retwin.monitor.live.stream_machine import BEHIND, TOLERATED, WINDOW, StreamMachine, Work
 from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.models import cause, visibility
 from retwin.monitor.models.cause import MIN_WINDOW, PROBABLE, Cause, cause_data, cause_text, is_due
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import BEYOND, Monitor
-from retwin.monitor.models.parts import Part
 from retwin.monitor.models.trajectory import monitor as trajectories
 from retwin.monitor.models.trajectory.evidence import Compared
 from retwin.monitor.models.trajectory.monitor import COMPARABLE, SHOWN, TrajectoryMonitor
-from retwin.monitor.models.visible import SHARE, Visible
-from retwin.monitor.models.watched import Alarm, Ending
+from retwin.monitor.models.watched import SHARE, Alarm, Ending, Part, Visible
 from retwin.monitor.server import journal, views
-from retwin.monitor.store.samples import Samples, Trajectory
-from retwin.monitor.store.updates import Asset
+from retwin.monitor.store.samples import Asset, Samples, Trajectory
 from retwin.monitor.versions import comparison
 from retwin.monitor.versions.decision import MIN_SAMPLES, decide
 from retwin.monitor.versions.recalibration import _events, _parts
@@ -534,8 +530,7 @@ def found_cause(
         record,
         alarms,
         faults,
-        current=current,
-        unexplained=unexplained,
+        current=(current, unexplained),
     )
     if found is not None:
         found |= vars(made)

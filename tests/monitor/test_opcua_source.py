@@ -18,8 +18,7 @@ from collecting import CollectingGate, running, wait
 from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError
 from retwin.monitor.settings import OpcUaSource
-from retwin.monitor.sources.assembly import Assembly
-from retwin.monitor.sources.opcua import OpcUa
+from retwin.monitor.sources.opcua import Assembly, OpcUa
 
 SCRIPT = Path(__file__).with_name("opcua_server.py")
 BEGIN = nanoseconds(datetime(2026, 1, 1, tzinfo=UTC))

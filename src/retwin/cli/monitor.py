@@ -58,8 +58,8 @@ EQUATIONS = (
 """What would watch the twin itself, where a black box takes its place."""
 FEW = 6
 """Faults that are listed, at most."""
-EARLIER = "; before, by fewer samples: "
-"""What stands between a cause and the one that was named before it."""
+EARLIER = "before, by fewer samples: "
+"""What stands before a cause in whose place another one was named later."""
 CONFIG = Path("monitor.toml")
 Reading = Callable[..., Trajectories]
 """`cli.reading.read` with the options of the command."""
@@ -115,17 +115,14 @@ def fit(
     if updated is None and system is None and mapping is None and tables:
         records = [read_signals(healthy, max_bytes)]
     else:
-        records = [
-            _healthy(reading(file, system or _named(updated), part="calibration"), file)
-            for file in healthy
-        ]
+        own = partial(reading, case=system or _named(updated), part="calibration")
+        records = [_healthy(own(file), file) for file in healthy]
     with bar("calibrate") as show:
         show("monitor", 0.0)
         given = Trajectories.concatenate(records)
         checked = check_with_twin(known, given)
-        made = fit_monitor(
-            known, given, false_alarms, lasting=3600.0 if lasting is None else lasting
-        )
+        more = {} if lasting is None else {"lasting": lasting}
+        made = fit_monitor(known, given, false_alarms, **more)
         show("faults that are seen", 0.5)
         causes = possible_causes(made.twin, system and system.alarm_causes)
         seen = partial(show, "faults that are seen")
@@ -181,9 +178,9 @@ def replay(
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
         found.append((file, record, watched, causes))
-        for trajectory, *row in _event_rows(watched, causes, record.rate):
+        for trajectory, begin, end, what, lines in _event_rows(watched, causes, record.rate):
             own = f"{file.name}, {trajectory}" if len(record) > 1 else file.name
-            rows.append(_describe_event(own, *row))
+            rows.append(_describe_event(own, begin, end, what, lines))
     answer(
         {
             "arl": made.arl,
@@ -218,7 +215,7 @@ def _fit_trajectories(
             Trajectories.concatenate(records),
             false_alarms,
             causes=system.causes if system else None,
-            progress=lambda share: show("diagnose", share),
+            progress=partial(show, "diagnose"),
         )
     made.save(out)
     about = {"saved": str(out), "arl": made.arl, "kappa": made.kappa, "promise": made.promise}
@@ -231,28 +228,26 @@ def _replay_trajectories(
 ) -> None:
     """Watch recorded trajectories of one machine, file after file."""
     from retwin.monitor import TrajectoryMonitor
-    from retwin.monitor.live.sentences import REMEDY
+    from retwin.monitor.live.notifications import REMEDY
+    from retwin.monitor.models.trajectory.state import REMARKS
 
     made, system, state = TrajectoryMonitor.load(monitor), case_named(case), None
     rows, found, texts = [], [], []
     for file in logs:
         record = reading(file, system)
         with bar("diagnose") as show:
-            state, watched = made.watch(
-                record, state, progress=lambda share, name=file.name: show(name, share)
-            )
+            state, watched = made.watch(record, state, progress=partial(show, file.name))
         rows += [
             (file.name, each.trajectory, str(each.number), each.name) for each in watched.alarms
         ]
         void = int(watched.void.sum())
-        kinds = ("outside", "unmeasured", "unranked", "implausible")
         found.append(
             {
                 "file": str(file),
                 "alarms": [vars(each) for each in watched.alarms],
                 "trajectories": len(record),
                 "void": void,
-                **{kind: int(getattr(watched, kind).sum()) for kind in kinds},
+                **{kind: int(getattr(watched, kind).sum()) for kind in REMARKS},
             }
         )
         texts.append(
@@ -438,15 +433,13 @@ def _causes(
         return []
     faults = possible_causes(monitor.twin, system and system.alarm_causes)
     with bar("explain") as show:
-        return find_causes(
-            monitor.twin, record, alarms, faults, progress=lambda share: show("alarms", share)
-        )
+        return find_causes(monitor.twin, record, alarms, faults, progress=partial(show, "alarms"))
 
 
 def _event_rows(
     watched: Watched, causes: Sequence[Cause], rate: float
-) -> list[tuple[str, str, str, str, str]]:
-    """Events with begin and end, and causes, the newest first.
+) -> list[tuple[str, str, str, str, list[str]]]:
+    """Record, begin, end and change of each event, and lines with its causes, the newest first.
 
     Events of a record that follow one with the same cause are in the row of that: a fault that
     lasts may not show for a while.
@@ -464,8 +457,8 @@ def _event_rows(
         return cause_text(vars(cause), known)
 
     ends = {(each.trajectory, each.event): each for each in watched.endings}
-    rows = list[tuple[str, str, str, str, str]]()
-    before, further, shown = ("", ""), 0, ""
+    rows = list[tuple[str, str, str, str, list[str]]]()
+    before, further, shown = ("", ""), 0, list[str]()
     for first in watched.events:
         named: list[Cause] = []
         for cause in causes:
@@ -481,28 +474,24 @@ def _event_rows(
         end = ends.get((first.trajectory, first.event))
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
-        begin, texts = f"{first.time:.6g}", EARLIER.join(map(text, reversed(named)))
+        begin, texts = f"{first.time:.6g}", list(map(text, reversed(named)))
         if named and before in [(first.trajectory, each.name) for each in named]:
             further += 1
             times = f"{further} time{'s' * (further > 1)}"
-            texts = f"{shown}; again, or still, {times} until {begin} s, then {text(named[-1])}"
-            rows[-1] = (*rows[-1][:2], until, rows[-1][3], texts)
+            again = f"again, or still, {times} until {begin} s, then {texts[0]}"
+            rows[-1] = (*rows[-1][:2], until, rows[-1][3], [*shown, again])
         else:
-            further = 0
-            shown = f"if it is a fault: {texts}" if named and not first.promised else texts
+            further, prefix = 0, "" if first.promised else "if it is a fault: "
+            shown = [(EARLIER if i else prefix) + each for i, each in enumerate(texts)]
             rows.append((first.trajectory, begin, until, what, shown))
         before = (first.trajectory, named[-1].name) if named else ("", "")
     return rows
 
 
-def _describe_event(record: str, begin: str, end: str, what: str, causes: str) -> str:
-    """An event as lines: when and what, and its causes, the newest first."""
+def _describe_event(record: str, begin: str, end: str, what: str, causes: Sequence[str]) -> str:
+    """An event as lines: when and what, and its causes."""
     until = ", which lasts" if end == "lasts" else f" until it was over or hidden at {end} s"
-    lines = [f"{record}, from {begin} s{until}: {what}"]
-    for number, part in enumerate(causes.split(EARLIER)):
-        first, *more = part.split("; again, or still")
-        lines += [EARLIER[2:] * (number > 0) + first, *(f"again, or still{e}" for e in more)]
-    return "\n    ".join(filter(None, lines))
+    return "\n    ".join([f"{record}, from {begin} s{until}: {what}", *causes])
 
 
 def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
@@ -540,7 +529,7 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     from scipy.stats import poisson
 
     from retwin.monitor.detect.promise import duration, shortest
-    from retwin.monitor.models.visible import SHARE
+    from retwin.monitor.models.watched import SHARE
     from retwin.report.labels import counted
 
     rate = monitor.twin.rate

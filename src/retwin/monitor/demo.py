@@ -28,12 +28,7 @@ from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 from retwin.twins.commands.samplers import HoldSampler
 from retwin.twins.faults.actuator_faults import Fault
-from retwin.twins.faults.system_faults import (
-    ActuatorGain,
-    ParameterShift,
-    SensorBias,
-    TimedFault,
-)
+from retwin.twins.faults.system_faults import ActuatorGain, ParameterShift, SensorBias, TimedFault
 from retwin.update import Dynamics, Library, fit_dynamics
 
 CASE = "incubator"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from datetime import time
@@ -23,8 +22,8 @@ from retwin.monitor.live.notifications import (
     FileChannel,
     Notifications,
     Receiver,
+    sentence,
 )
-from retwin.monitor.live.sentences import sentence
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.server import create_app, listening, serving
@@ -37,13 +36,11 @@ from retwin.monitor.settings import (
     TwinSettings,
     secret,
 )
-from retwin.monitor.sources.folder import Folder
-from retwin.monitor.sources.layouts import layout_of, mapped_layout
+from retwin.monitor.sources.folder import Folder, Recorded, TrajectoryFolder
 from retwin.monitor.sources.mqtt import Mqtt
 from retwin.monitor.sources.opcua import OpcUa
 from retwin.monitor.sources.source import Source
-from retwin.monitor.sources.tables import Layout
-from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
+from retwin.monitor.sources.tables import Layout, layout_of, mapped_layout
 from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 from retwin.serialisation.files import sha256
@@ -76,11 +73,8 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
     """
     with ExitStack() as opened:
         page = settings.server
-        token = (
-            check_token(secret("token, of 16 characters at least", page.token_env, page.token_file))
-            if page
-            else ""
-        )
+        what = "token, of 16 characters at least"
+        token = check_token(secret(what, page.token_env, page.token_file)) if page else ""
         bound = page and opened.enter_context(listening(page.host, page.port))
         for twin in settings.twins.values():
             load_monitor(twin.monitor)
@@ -95,18 +89,15 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
         news = _News(store, report)
         opened.callback(news.read)
         twins = {each.twin: live.monitor(name) for name, each in settings.assets.items()}
-        systems = {name: _case(settings.twins[name], each) for name, each in twins.items()}
-        faults = {name: each.alarm_causes for name, each in systems.items() if each}
-        explanations = Explanations(live, faults.get)
-        opened.enter_context(explanations)
+        known = {name: _case(settings.twins[name], each) for name, each in twins.items()}
+        systems = {name: known[each.twin] for name, each in settings.assets.items()}
+        faults = {name: each.alarm_causes for name, each in known.items() if each}
+        explanations = opened.enter_context(Explanations(live, faults.get))
         receivers = [_receiver(name, each) for name, each in settings.notify.items()]
         opened.enter_context(Notifications(store, receivers, report))
         gate = opened.enter_context(Gate(live))
-        sources = [
-            source
-            for each in settings.sources
-            for source in _sources(each, settings, live, systems, report)
-        ]
+        made = [_sources(each, live, systems, report) for each in settings.sources]
+        sources = [source for each in made for source in each]
         if page and bound:
             app = create_app(
                 live,
@@ -135,16 +126,15 @@ class _News:
     def __init__(self, store: Store, report: Callable[[str], None]) -> None:
         self._store = store
         self._report = report
-        newest = deque(store.log(), maxlen=1)
-        self._last = newest[0].sequence if newest else -1
+        last = store.last
+        self._last = last.sequence if last else -1
         self._failed = False
 
     def read(self) -> None:
         """Report them; a store that cannot be read is reported once, and read again later."""
         try:
             for entry in self._store.log(after=self._last):
-                line = sentence(entry)
-                if line:
+                if line := sentence(entry):
                     self._report(line)
                 self._last = entry.sequence
         except InputError as error:
@@ -180,18 +170,17 @@ def _receiver(name: str, settings: NotifySettings) -> Receiver:
 
 
 def _sources(
-    settings: Any,
-    whole: MonitorSettings,
-    live: Live,
-    systems: Mapping[str, Case | None],
-    report: Callable[[str], None],
+    settings: Any, live: Live, systems: Mapping[str, Case | None], report: Callable[[str], None]
 ) -> list[Source]:
-    """What reads a source: of a folder, one for samples, one for trajectories, or both."""
-    channels = {name: live.channels(name) for name in whole.assets}
+    """What reads a source: of a folder, one for samples, one for trajectories, or both.
+
+    `systems` are the cases of all machines.
+    """
+    channels = {name: live.channels(name) for name in systems}
     if isinstance(settings, MqttSource):
         return [Mqtt(settings, channels, report)]
     if isinstance(settings, FolderSource):
-        return _folders(settings, whole, live, systems, report)
+        return _folders(settings, live, systems, report)
     for name in settings.nodes:
         require(
             not live.in_trajectories(name),
@@ -200,26 +189,24 @@ def _sources(
             got=f"one of single samples, {settings.type}",
             remedy="send trajectories by MQTT or HTTP, or write them to a folder",
         )
-    rates = {name: live.monitor(name).twin.rate for name in whole.assets}
+    rates = {name: live.monitor(name).twin.rate for name in systems}
     return [OpcUa(settings, channels, rates, report)]
 
 
 def _folders(
     settings: FolderSource,
-    whole: MonitorSettings,
     live: Live,
     systems: Mapping[str, Case | None],
     report: Callable[[str], None],
 ) -> list[Source]:
-    cases_ = {name: systems[asset.twin] for name, asset in whole.assets.items()}
     newest = {each.asset: each.time for each in live.status() if each.time is not None}
     mapping = None if settings.mapping is None else read_mapping(settings.mapping)
     layouts: dict[str, Layout] = {}
     recorded: dict[str, Recorded] = {}
-    for name in [settings.asset] if settings.asset else whole.assets:
-        monitor = live.monitor(name)
+    for name in [settings.asset] if settings.asset else systems:
+        monitor, case = live.monitor(name), systems[name]
         if isinstance(monitor, TrajectoryMonitor):
-            recorded[name] = Recorded(monitor, cases_[name])
+            recorded[name] = Recorded(monitor, case)
         else:
             require(
                 settings.files.endswith((".csv", ".parquet")),
@@ -228,7 +215,7 @@ def _folders(
                 got=settings.files,
                 remedy="give tables of samples, since its monitor watches no whole trajectories",
             )
-            twin, case = monitor.twin, cases_[name]
+            twin = monitor.twin
             layouts[name] = (
                 layout_of(settings, live.channels(name), case)
                 if mapping is None

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,11 +90,7 @@ class Tails:
 
     share: float
     ratio: float
-
-    @property
-    def change(self) -> str:
-        """See `Alternative.change`."""
-        return "single large errors"
+    change: ClassVar[str] = "single large errors"
 
     def log_bet(self, score: NDArray, previous: float, kappa: float) -> NDArray:
         """Likelihood ratio of the contaminated Gaussian distribution."""
@@ -107,11 +103,7 @@ class Dependence:
     """A `correlation` of each score with the one before."""
 
     correlation: float
-
-    @property
-    def change(self) -> str:
-        """See `Alternative.change`."""
-        return "errors that depend on each other"
+    change: ClassVar[str] = "errors that depend on each other"
 
     def log_bet(self, score: NDArray, previous: float, kappa: float) -> NDArray:
         """A shift of the mean in proportion to the score before."""
@@ -128,11 +120,7 @@ class Repetition:
 
     share: float
     width: float
-
-    @property
-    def change(self) -> str:
-        """See `Alternative.change`."""
-        return "errors that repeat"
+    change: ClassVar[str] = "errors that repeat"
 
     def log_bet(self, score: NDArray, previous: float, kappa: float) -> NDArray:
         """Likelihood ratio of a mixture of a Gaussian distribution around the score before."""

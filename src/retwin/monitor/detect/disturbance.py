@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import mul
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -224,20 +225,12 @@ def _errors(
             for j in range(i, order):
                 covariance[i, j] -= gain[i] * first[j]
         # One step on: the newest value is a sum of the others, which move by one place.
-        newest = coefficients[0] * mean[0]
-        for i in range(1, order):
-            newest = newest + coefficients[i] * mean[i]
+        newest = sum(map(mul, coefficients, mean))
         mean[1:] = mean[:-1].copy()
         mean[0] = newest
-        row = []
-        for i in range(order):
-            total = coefficients[0] * covariance[0, i]
-            for j in range(1, order):
-                total = total + coefficients[j] * covariance[min(i, j), max(i, j)]
-            row.append(total)
-        corner = coefficients[0] * row[0] + process
-        for i in range(1, order):
-            corner = corner + coefficients[i] * row[i]
+        columns = ([covariance[min(i, j), max(i, j)] for j in range(order)] for i in range(order))
+        row = [sum(map(mul, coefficients, column)) for column in columns]
+        corner = sum(map(mul, coefficients, row), process)
         covariance[1:, 1:] = covariance[:-1, :-1].copy()
         covariance[0, 0] = corner
         for i in range(1, order):

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from numbers import Real
+from typing import Any
 
-from retwin.checks import finite, positive, whole
-from retwin.errors import InputError
+from retwin.checks import finite, given, positive, whole
 from retwin.monitor.detect.slack import Slack
 from retwin.times import sample_rate
 
@@ -26,7 +25,11 @@ MIN_RUN_LENGTH, MAX_RUN_LENGTH = 10.0, 1e15
 at common rates, and above 1e15 the sums of a detector no longer count single samples."""
 SIGNIFICANCE = 0.05
 """Probability of the observed false alarms or more, below which the promise counts as broken."""
-NUMBER = r"(\d+(?:\.\d*)?(?:e[+-]?\d+)?)"
+FORMS = re.compile(
+    r"(?P<number>\d+(?:\.\d*)?(?:e[+-]?\d+)?) ?"
+    rf"(?:(?:per|an?) (?P<unit>{'|'.join(SECONDS)})s?|hz|(?P<count>samples?|trajector(?:y|ies)))"
+)
+"""How a rate of false alarms, or a run length, may be written."""
 
 
 def false_alarms(wanted: str | float, rate: float) -> float:
@@ -58,31 +61,15 @@ def false_alarms(wanted: str | float, rate: float) -> float:
     """
     per_second = sample_rate("rate", rate)
     remedy = "write '1 per month', '2 per year', '1e-6 Hz' or '1000 samples'"
+    samples: Any = wanted
     if isinstance(wanted, str):
         text = " ".join(wanted.lower().split())
-        of_time = re.fullmatch(rf"{NUMBER} (?:per|a|an) (\w+?)s?", text)
-        of_rate = re.fullmatch(rf"{NUMBER} ?hz", text)
-        of_samples = re.fullmatch(rf"{NUMBER} (?:samples?|trajector(?:y|ies))", text)
-        if of_time and of_time[2] in SECONDS and float(of_time[1]) > 0:
-            samples = SECONDS[of_time[2]] * per_second / float(of_time[1])
-        elif of_rate and float(of_rate[1]) > 0:
-            samples = per_second / float(of_rate[1])
-        elif of_samples:
-            samples = float(of_samples[1])
-        else:
-            units = ", ".join(SECONDS)
-            raise InputError(
-                "false_alarms",
-                expected=f"a number per {units}, a rate in Hz, or a number of samples",
-                got=repr(wanted),
-                remedy=remedy,
-            )
-    elif isinstance(wanted, Real) and not isinstance(wanted, bool):
-        samples = float(wanted)
-    else:
-        raise InputError(
-            "false_alarms", expected="a text or a number", got=repr(wanted), remedy=remedy
-        )
+        expected = f"a number per {', '.join(SECONDS)}, a rate in Hz, or a number of samples"
+        form, got = FORMS.fullmatch(text), repr(wanted)
+        found = given("false_alarms", form, expected, got=got, remedy=remedy)
+        number = positive("false_alarms", float(found["number"]), remedy=remedy)
+        time = SECONDS[found["unit"] or "second"] * per_second
+        samples = number if found["count"] else time / number
     return finite(
         "false_alarms",
         samples,

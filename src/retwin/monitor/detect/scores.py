@@ -117,15 +117,12 @@ class ConformalScores:
 
         `parameters` is one number of estimated parameters for all streams, or one for each.
         """
-        each = np.broadcast_to(parameters, self.independent.shape)
-        keys = list(zip(np.floor(self.independent).tolist(), each.tolist(), strict=True))
-        made = {
-            (count, estimated): Slack.of_calibration(
-                count, parameters=estimated, confidence=confidence
-            )
-            for count, estimated in set(keys)
-        }
-        return tuple(made[key] for key in keys)
+        each = np.broadcast_to(parameters, self.independent.shape).tolist()
+        pairs = zip(np.floor(self.independent).tolist(), each, strict=True)
+        return tuple(
+            Slack.of_calibration(count, parameters=estimated, confidence=confidence)
+            for count, estimated in pairs
+        )
 
 
 def fit_scores(errors: ArrayLike, width: ArrayLike = 0.0) -> ConformalScores:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +72,7 @@ class Slack:
         return cls(min(round(up[0], 2), 10.0), min(round(up[1], 2), 3.0))
 
     @classmethod
+    @lru_cache(maxsize=256)  # streams of one record are many alike
     def of_calibration(
         cls, samples: float, *, parameters: int = 0, confidence: float = 0.95
     ) -> Slack:

@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from retwin.checks import require
+from retwin.checks import at_least
 from retwin.data.trajectories import UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.live.live import Live
 from retwin.monitor.models.cause import (
     BEFORE,
     EVENT,
-    Cause,
     cause_data,
     find_cause,
     is_due,
@@ -35,9 +34,6 @@ from retwin.twins.faults.actuator_faults import Fault
 
 Faults = Callable[[str], "Mapping[str, Fault | None] | None"]
 """The known faults of a twin by its name; None for any change."""
-
-
-NONE: Mapping[int, dict[str, Any]] = {}
 
 
 class _Turns(queue.Queue["list[Entry] | None"]):
@@ -141,11 +137,9 @@ class Explanations:
         alarms = [each for each in entries if each.kind == "alarm"]
         if alarms and not self._closed.is_set():
             with self._taking:
-                self._take(each for each in alarms if each.sequence > self._last)
+                self._take((each for each in alarms if each.sequence > self._last), {})
 
-    def _take(
-        self, alarms: Iterable[Entry], explained: Mapping[int, dict[str, Any]] = NONE
-    ) -> None:
+    def _take(self, alarms: Iterable[Entry], explained: Mapping[int, dict[str, Any]]) -> None:
         """Queue the alarms at which a cause is due, each after those that it is inferred with."""
         for entry in alarms:
             data, asset = entry.data, entry.data["asset"]
@@ -185,7 +179,7 @@ class Explanations:
         entry = alarms[-1]
         alarm = entry.data
         try:
-            found = _data(*self._found(alarms))
+            found = self._found(alarms)
         except Exception as error:  # Whatever fails is an entry, and the next alarm is explained.
             same = _event(alarm) != alarm["time"]
             found = cause_data(UNKNOWN, 0.0, 1.0, {}) | {"note": brief(error), "same": same}
@@ -197,8 +191,8 @@ class Explanations:
         except Exception:  # of the caller; further alarms are explained all the same
             logging.getLogger(__name__).exception("a cause was found but not reported")
 
-    def _found(self, entries: list[Entry]) -> tuple[Cause, int]:
-        """The cause of the last alarm, and the time of the first sample that it was found from."""
+    def _found(self, entries: list[Entry]) -> dict[str, Any]:
+        """The cause of the last alarm as data of the log."""
         store, last = self._live.store, entries[-1].data
         name = last["asset"]
         twin = next(each for each in store.assets() if each.name == name).settings["twin"]
@@ -208,27 +202,20 @@ class Explanations:
         begin = max(opening, last["time"] - round(last["sample"] * period))
         half = round(period / 2)
         times, values = gridded(store, name, monitor.twin, begin - half, last["time"] + half)
-        require(
-            len(times) >= 2,
-            "samples",
-            expected="at least two before the alarm in the store",
-            got=len(times),
-            remedy="store more of them: see max_samples",
-        )
-        record = record_of(monitor.twin, values)
-        *earlier, newest = [_alarm(each.data, int(times[0]), period) for each in entries]
+        remedy = "store more of them: see max_samples"
+        at_least("samples", times, 2, "before the alarm in the store", remedy=remedy)
+        record, first = record_of(monitor.twin, values), int(times[0])
+        *earlier, newest = [_alarm(each.data, first, period) for each in entries]
         alarms = [*earlier, replace(newest, sample=record.steps - 1)]
-        current, unexplained = self._current.get((name, _event(last)), ("", 0.0))
-        found = find_cause(
-            monitor.twin,
-            record,
-            alarms,
-            self.causes(twin, monitor),
-            current=current,
-            unexplained=unexplained,
-            known_start=False,
-        )
-        return found, int(times[0])
+        has, causes = self._current.get((name, _event(last)), ("", 0.0)), self.causes(twin, monitor)
+        given = monitor.twin, record, alarms, causes
+        cause = find_cause(*given, current=has, known_start=False)
+        ends = cause.size, cause.onset
+        size, onset = ([each if np.isfinite(each) else None for each in end] for end in ends)
+        moments = [None if each is None else first + round(each * SECOND) for each in onset]
+        shares = cause.probability, cause.unknown, cause.probabilities
+        data = cause_data(cause.name, *shares, size, cause.unit, moments, limit=cause.limit)
+        return data | {"same": cause.same}
 
 
 def _alarm(data: dict[str, Any], first: int, period: float) -> Alarm:
@@ -241,12 +228,3 @@ def _alarm(data: dict[str, Any], first: int, period: float) -> Alarm:
 def _event(alarm: Mapping[str, Any]) -> int:
     """The time of the first alarm of an alarm's event."""
     return int(alarm.get("event", alarm["time"]))
-
-
-def _data(cause: Cause, first: int) -> dict[str, Any]:
-    """A cause as data of the log, whose first sample was at a time in nanoseconds."""
-    size = [each if np.isfinite(each) else None for each in cause.size]
-    onset = [first + round(each * SECOND) if np.isfinite(each) else None for each in cause.onset]
-    shares = cause.probability, cause.unknown, cause.probabilities
-    data = cause_data(cause.name, *shares, size, cause.unit, onset, limit=cause.limit)
-    return data | {"same": cause.same}

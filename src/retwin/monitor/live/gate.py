@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from retwin.errors import InputError
 from retwin.monitor.live.live import Live
-from retwin.monitor.live.status import Received
+from retwin.monitor.live.machine import Received
 from retwin.monitor.store.samples import Samples, Trajectory
 
 QUEUE = 10_000
@@ -86,18 +86,13 @@ class Gate:
     def _run(self, own: queue.Queue[_Waiting | None]) -> None:
         open_ = True
         while open_:
-            group: list[_Waiting] = []
-            waiting = own.get()
-            count = 0
+            group, count, waiting = list[_Waiting](), 0, own.get()
             while waiting is not None:
                 group.append(waiting)
                 count += len(waiting[0].values)
-                if count >= GROUP:
+                if count >= GROUP or own.empty():  # this thread alone takes from it
                     break
-                try:
-                    waiting = own.get_nowait()
-                except queue.Empty:
-                    break
+                waiting = own.get()
             open_ = waiting is not None
             active = [each for each in group if each[1].set_running_or_notify_cancel()]
             if active:

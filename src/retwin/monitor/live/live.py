@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import groupby
@@ -14,19 +14,17 @@ from typing import Any
 import numpy as np
 
 from retwin.checks import finite, given, instance, require, whole
-from retwin.monitor.live.layout import Layout
-from retwin.monitor.live.machine import Counts, Recent
-from retwin.monitor.live.status import AssetStatus, Received
+from retwin.monitor.live.machine import AssetStatus, Counts, Received, Recent
 from retwin.monitor.live.stream_machine import StreamMachine, Work, step
 from retwin.monitor.live.trajectory_machine import TrajectoryMachine
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
 from retwin.monitor.models.monitor import Monitor
+from retwin.monitor.models.monitor_state import Layout
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.store.audit import Entry
-from retwin.monitor.store.limits import Limits
-from retwin.monitor.store.samples import SECOND, Samples, Trajectory
+from retwin.monitor.store.gridded import Limits
+from retwin.monitor.store.samples import LATEST, SECOND, Asset, Samples, Trajectory, one_asset
 from retwin.monitor.store.store import Store
-from retwin.monitor.store.updates import LATEST, Asset, one_asset
 from retwin.monitor.versions.registry import Registry
 
 MAX_WAIT = 60.0
@@ -124,8 +122,7 @@ class Live:
             self.refresh()
             before = known.settings.get("twin") if known else None
             if before not in (None, twin):
-                text = f"watched by the twin {twin} from the next sample on, before by {before}"
-                self.log([("event", _event(asset, self._clock(), text))])
+                self.log([self._describe_change(asset, f"the twin {twin}", before)])
 
     def refresh(self) -> None:
         """Read assets and active versions again: after a version was promoted or rolled back.
@@ -142,11 +139,8 @@ class Live:
                 if twin not in active:
                     active[twin] = self._active(twin)
                 if asset.version != active[twin]:
-                    text = (
-                        f"watched by version {active[twin]} from the next sample on, before by "
-                        f"{asset.version}"
-                    )
-                    entries.append(("event", _event(asset, self._clock(), text)))
+                    now, before = f"version {active[twin]}", asset.version
+                    entries.append(self._describe_change(asset, now, before))
                     asset = replace(asset, version=active[twin])
                     self.store.add_asset(asset)
                 known = self._machines.get(asset.name)
@@ -202,7 +196,7 @@ class Live:
     def status(self) -> list[AssetStatus]:
         """All machines, those with most evidence for a change first."""
         with self._lock:
-            made = [AssetStatus.of(each, each.monitor.arl) for each in self._machines.values()]
+            made = [AssetStatus.of(each) for each in self._machines.values()]
         return sorted(made, key=lambda each: (-each.void, -each.ratio))
 
     def recent(self, asset: str) -> Recent:
@@ -232,20 +226,11 @@ class Live:
         require(who.strip(), "who", expected="who has seen it", got=repr(who), remedy=remedy)
         after = whole("sequence", sequence, at_least=0) - 1
         entry = next(iter(self.store.log("alarm", after=after)), None)
-        require(
-            entry is not None and entry.sequence == sequence,
-            "sequence",
-            expected="that of an alarm in the log",
-            got=sequence,
-            remedy="see the alarms",
-        )
+        known = entry if entry and entry.sequence == sequence else None
+        expected = "that of an alarm in the log"
+        given("sequence", known, expected, got=sequence, remedy="see the alarms")
         data = {"alarm": sequence, "who": who, "note": note, "at": self._clock()}
         self.log([("acknowledge", data)])
-
-    def _read_again(self) -> None:
-        for name in sorted(self._unsure & self._machines.keys()):
-            self._machines[name] = self._machine(self._machines[name].asset)
-            self._unsure.discard(name)
 
     def _samples(self, given: Samples | Trajectory) -> Samples:
         """A trajectory of a machine that is watched sample by sample is its samples."""
@@ -257,8 +242,7 @@ class Live:
         """Use one trajectory."""
         with self._diagnosing:
             while True:
-                with self._lock, self._rereading(given.asset):
-                    self._read_again()
+                with self._using(given.asset):
                     machine = self._one(given.asset)
                     assert isinstance(machine, TrajectoryMachine)
                     received = self._unused(machine, given)
@@ -266,7 +250,7 @@ class Live:
                     return received
                 assert isinstance(given, Trajectory)
                 made = machine.diagnose(given)
-                with self._lock, self._rereading(given.asset):
+                with self._using(given.asset):
                     if self._machines.get(given.asset) is not machine:
                         continue  # another version watches since
                     if made.watched is None:
@@ -304,42 +288,38 @@ class Live:
         return self._clock() + round(self._ahead * SECOND)
 
     @contextmanager
-    def _rereading(self, *assets: str) -> Iterator[None]:
-        """Machines are read from the store again after an exception in the block.
+    def _using(self, *assets: str) -> Iterator[None]:
+        """Hold the lock; machines are read from the store again after an exception in the block.
 
-        What the store holds is true, but it may not be in reach now.
+        What the store holds is true, but it may not be in reach before the next block.
         """
-        try:
-            yield
-        except BaseException:
-            self._unsure |= set(assets)
-            raise
+        with self._lock:
+            for name in sorted(self._unsure & self._machines.keys()):
+                self._machines[name] = self._machine(self._machines[name].asset)
+                self._unsure.discard(name)
+            try:
+                yield
+            except BaseException:
+                self._unsure |= set(assets)
+                raise
 
     def _sampled(self, batch: Sequence[Samples]) -> list[Received]:
         """Use samples of machines that are watched sample by sample, in one commit."""
-        with self._lock, self._rereading(*(each.asset for each in batch)):
-            self._read_again()
-            return self._submitted(batch)
-
-    def _streams(self, names: Iterable[str]) -> list[StreamMachine]:
-        machines = [self._one(name) for name in names]
-        return [each for each in machines if isinstance(each, StreamMachine)]
-
-    def _submitted(self, batch: Sequence[Samples]) -> list[Received]:
-        limit = self._limit()
-        found, alarms = [], Counter[str]()
-        streams = self._streams(each.asset for each in batch)
-        for each, machine in zip(batch, streams, strict=True):
-            counts = Counts()
-            known = set(self.store.present(each.asset, machine.unsure(each.times)).tolist())
-            left = machine.accept(each, limit, known, counts)
-            while len(left.times):
-                alarms += self._stepped([machine])
-                left = machine.accept(left, limit, known, counts)
-            found.append(counts)
-        machines = list(dict.fromkeys(streams))
-        alarms += self._stepped(machines)
-        self._commit(machines)
+        names = [each.asset for each in batch]
+        limit, found, alarms = self._limit(), [], Counter[str]()
+        with self._using(*names):
+            streams = [each for each in map(self._one, names) if isinstance(each, StreamMachine)]
+            for each, machine in zip(batch, streams, strict=True):
+                counts = Counts()
+                known = set(self.store.present(each.asset, machine.unsure(each.times)).tolist())
+                left = machine.accept(each, limit, known, counts)
+                while len(left.times):
+                    alarms += self._stepped([machine])
+                    left = machine.accept(left, limit, known, counts)
+                found.append(counts)
+            machines = list(dict.fromkeys(streams))
+            alarms += self._stepped(machines)
+            self._commit(machines)
         last = {each.asset: i for i, each in enumerate(batch)}
         return [
             Received(each.asset, counts, alarms[each.asset] * (last[each.asset] == i))
@@ -350,12 +330,11 @@ class Live:
         """Step the monitors of machines through what is complete; alarms by machine."""
         alarms = Counter[str]()
         while ready := [(each, work) for each in machines if (work := each.next_work())]:
-            key: Callable[[tuple[StreamMachine, Work]], tuple] = lambda each: (  # noqa: E731
-                id(each[0].monitor),
-                len(each[1].values),
-            )
-            for _, group in groupby(sorted(ready, key=key), key):
-                together = list(group)
+            groups: dict[tuple[int, int], list[tuple[StreamMachine, Work]]] = {}
+            for each, work in ready:
+                alike = id(each.monitor), len(work.values)
+                groups.setdefault(alike, []).append((each, work))
+            for together in groups.values():
                 alarms.update(step(together))
         return alarms
 
@@ -378,12 +357,18 @@ class Live:
                 watched.restore(*stored)
             return watched
         if digest not in self._layouts:
-            self._layouts[digest] = Layout(monitor, digest)
+            self._layouts[digest] = Layout(monitor.start(1), digest)
         machine = StreamMachine(asset, monitor, self._layouts[digest], self._wait)
         if stored is not None and machine.restore(stored[1]):
             for times, values in self.store.samples(asset.name, machine.stepped_time):
                 machine.hold(times, values)
         return machine
+
+    def _describe_change(self, asset: Asset, now: str, before: object) -> tuple[str, dict]:
+        """The entry of the log about what watches a machine from now on, and what did before."""
+        text = f"watched by {now} from the next sample on, before by {before}"
+        about = {"asset": asset.name, "time": self._clock(), "what": "version", "text": text}
+        return "event", about
 
     def _active(self, twin: str) -> int:
         active, expected = Registry(self.store, twin).active, f"an active version of {twin}"
@@ -397,7 +382,3 @@ class Live:
             digest = {each.number: each.digest for each in registry.versions()}[version]
             self._monitors[key] = load_monitor(registry.folder(version)), digest
         return self._monitors[key]
-
-
-def _event(asset: Asset, moment: int, text: str) -> dict[str, Any]:
-    return {"asset": asset.name, "time": moment, "what": "version", "text": text}

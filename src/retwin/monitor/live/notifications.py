@@ -12,19 +12,19 @@ import json
 import os
 import threading
 import warnings
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import datetime, time
+from datetime import UTC, datetime, time
 from pathlib import Path
 from typing import Protocol
 
 from retwin.checks import needs_extra, require
-from retwin.errors import InputError, brief
-from retwin.monitor.live.sentences import sentence
+from retwin.errors import brief
+from retwin.monitor.models.cause import cause_text
 from retwin.monitor.store.audit import Entry
+from retwin.monitor.store.samples import SECOND
 from retwin.monitor.store.store import Store
-from retwin.serialisation.files import write_atomically
+from retwin.serialisation.files import refusing, write_atomically
 
 FIRST, LONGEST = 1.0, 300.0
 """Seconds after which a message that failed is sent again at first, and at most."""
@@ -152,9 +152,9 @@ class Notifications:
         self._file = store.folder / FILE
         self._sent = _read(self._file)
         self._lock, self._stop = threading.Lock(), threading.Event()
-        newest = deque(store.log(), maxlen=1)
+        last = store.last
         for each in receivers:
-            self._sent.setdefault(each.name, newest[0].sequence if newest else -1)
+            self._sent.setdefault(each.name, last.sequence if last else -1)
         self._write()
         self._threads = [
             threading.Thread(target=self._run, args=(each,), name=f"notify {each.name}")
@@ -206,16 +206,50 @@ class Notifications:
 
 def _read(file: Path) -> dict[str, int]:
     """The newest entry that each receiver was sent, as an earlier run has left it."""
-    try:
-        return {
-            str(name): int(sequence) for name, sequence in json.loads(file.read_bytes()).items()
-        }
-    except FileNotFoundError:
+    if not file.exists():
         return {}
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise InputError(
-            str(file),
-            expected="a file that says which entries were sent",
-            got=brief(error),
-            remedy="remove it: then only new entries are sent",
-        ) from None
+    expected = "a file that says which entries were sent"
+    with refusing(file, expected=expected, remedy="remove it: then only new entries are sent"):
+        sent = json.loads(file.read_bytes())
+        return {str(name): int(sequence) for name, sequence in sent.items()}
+
+
+REMEDY = (
+    "Look for a fault first. Only if it is healthy, recalibrate: until then what follows are "
+    "remarks, and no alarms"
+)
+"""What to do where a promise is void."""
+
+
+def sentence(entry: Entry) -> str:
+    """An entry of the log in a line; "" for one that is not reported."""
+    data = entry.data
+    if entry.kind == "version":
+        reason = f": {data['reason']}" if data.get("reason") else ""
+        return f"twin {data['twin']}: {data['step']} version {data['version']}{reason}"
+    if entry.kind == "cause":
+        onset = data["onset"][0]
+        if data.get("same"):
+            return ""  # the event has its cause
+        found = cause_text(data, "" if onset is None else moment_text(onset))
+        return f"{data['asset']}: cause of alarm {data['alarm']}: {found}"
+    texts = {
+        "alarm": "ALARM {sequence}: {output}, {change}",
+        "remark": "remark, for which nothing is promised: {output}, {change}",
+        "end": "event ended, {how}",
+        "void": "promise VOID: the machine is not the one of the calibration. " + REMEDY,
+        "event": "{text}",
+    }
+    opens = data.get("event", data.get("time")) == data.get("time")
+    if entry.kind not in texts or not (opens or entry.kind == "end"):
+        return ""  # an event is one line, though more alarms belong to it
+    text = texts[entry.kind].format(sequence=entry.sequence, **data)
+    if "cause" in data:
+        text += f", cause: {cause_text(data['cause'], '')}"
+    return f"{data['asset']}: {text} ({moment_text(data['time'])})"
+
+
+def moment_text(time: int) -> str:
+    """A time in ns, to the second."""
+    moment = datetime.fromtimestamp(round(time / SECOND), UTC)
+    return moment.isoformat().replace("+00:00", "Z")

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.monitor.live.layout import Layout
 from retwin.monitor.live.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.models.monitor import Monitor
+from retwin.monitor.models.monitor_state import Layout
 from retwin.monitor.models.watched import Watched
-from retwin.monitor.store.limits import Limits
-from retwin.monitor.store.samples import SECOND, Samples
-from retwin.monitor.store.updates import EARLIEST, Asset, Update
+from retwin.monitor.store.gridded import Limits
+from retwin.monitor.store.samples import EARLIEST, SECOND, Asset, Samples, Update
 
 ALARM = ("sample", "output", "change", "evidence", "machine")
 """What the log has of an alarm, beside its time and that of its event."""
@@ -79,7 +78,7 @@ class StreamMachine(Machine[Monitor]):
         self._missing = np.full(asset.channels, np.nan)
         self._origin: int | None = None
         self._done = -1
-        self._pending: dict[int, tuple[int, NDArray]] = {}
+        self._pending: dict[int, NDArray] = {}
         self._farthest = -1
         self._rows: list[NDArray] = []
         self._work: deque[Work] = deque()
@@ -93,7 +92,9 @@ class StreamMachine(Machine[Monitor]):
         self._limits = Limits.of(monitor.twin, asset.settings.get("limits", {}))
         self._doubtful = np.zeros(asset.channels)
         """Places until each channel counts as possible again; 0 for one that is."""
-        self._recent: deque[tuple[NDArray, ...]] = deque()
+        commands, measured = np.split(self._missing[None, :][:0], [self._commands], axis=1)
+        none = np.zeros(0, dtype=np.int64), commands, measured, measured, measured, np.zeros(0)
+        self._recent: deque[tuple[NDArray, ...]] = deque([none])
         self._kept = 0
 
     @property
@@ -157,7 +158,7 @@ class StreamMachine(Machine[Monitor]):
         for moment, row in zip(times.tolist(), values, strict=True):
             place = self._place(moment)
             if place > self._done:
-                self._pending[place] = moment, row
+                self._pending[place] = row
                 self._farthest = max(self._farthest, place)
                 self.newest = max(self.newest or moment, moment)
 
@@ -169,13 +170,7 @@ class StreamMachine(Machine[Monitor]):
         """The monitor's state before these samples, as a row of the layout."""
         return self.layout.start if work.begins else self._state
 
-    def stepped(
-        self,
-        work: Work,
-        state: NDArray,
-        watched: Watched,
-        row: int,
-    ) -> None:
+    def stepped(self, work: Work, state: NDArray, watched: Watched, row: int) -> None:
         """Take the state after these samples, and what was found in them, a row of `watched`."""
         name = self.asset.name
         alarms = [each for each in watched.alarms if each.trajectory == name]
@@ -212,13 +207,7 @@ class StreamMachine(Machine[Monitor]):
 
     def recent(self) -> Recent:
         """The newest samples."""
-        if not self._recent:
-            inputs, outputs = self._commands, self.asset.channels - self._commands
-            none, times = np.zeros((0, outputs)), np.zeros(0, dtype=np.int64)
-            return Recent(times, np.zeros((0, inputs)), none, none, none, np.zeros(0))
-        times, *more = (np.concatenate(each)[-KEPT:] for each in zip(*self._recent, strict=True))
-        commands, measured, mean, deviation, evidence = more
-        return Recent(times, commands, measured, mean, deviation, evidence)
+        return Recent(*(np.concatenate(each)[-KEPT:] for each in zip(*self._recent, strict=True)))
 
     def update(self) -> Update | None:
         """Samples that are not stored yet, and the state after those that were stepped."""
@@ -293,8 +282,7 @@ class StreamMachine(Machine[Monitor]):
                 return "unknown"
             self._begin(moment)
         place = self._place(moment)
-        self._pending[place] = moment, row
-        self._new[moment] = row
+        self._pending[place] = self._new[moment] = row
         self._farthest = max(self._farthest, place)
         self.newest = moment if self.newest is None else max(self.newest, moment)
         self._late = 0
@@ -320,10 +308,8 @@ class StreamMachine(Machine[Monitor]):
         self._late += 1
         if self._late == BEHIND and self.newest is not None:
             behind = (self.newest - moment) / SECOND
-            text = (
-                f"samples are {behind:.6g} s behind the newest one and not used: a clock set back?"
-            )
-            self.log("event", self.newest, what="clock", text=text)
+            text = f"samples are {behind:.6g} s behind the newest one and not used"
+            self.log("event", self.newest, what="clock", text=f"{text}: a clock set back?")
         return "late"
 
     def _advance(self, wait: int) -> None:
@@ -333,7 +319,7 @@ class StreamMachine(Machine[Monitor]):
             found = self._pending.pop(place, None)
             if found is None and self._farthest - place < wait:
                 return
-            self._rows.append(self._measured(place, self._missing if found is None else found[1]))
+            self._rows.append(self._measured(place, self._missing if found is None else found))
             self._done = place
             self._checked_rate(place, missing=found is None)
 

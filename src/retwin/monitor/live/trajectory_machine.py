@@ -17,11 +17,9 @@ from retwin.errors import InputError, brief
 from retwin.monitor.live.machine import KEPT, Machine, Recent
 from retwin.monitor.models.cause import cause_data
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
-from retwin.monitor.models.trajectory.state import TrajectoryState
-from retwin.monitor.models.trajectory.watched import REMARKS, WatchedTrajectories
+from retwin.monitor.models.trajectory.state import REMARKS, TrajectoryState, WatchedTrajectories
 from retwin.monitor.store.gridded import record_of
-from retwin.monitor.store.samples import Samples, Trajectory
-from retwin.monitor.store.updates import Asset, Update
+from retwin.monitor.store.samples import Asset, Samples, Trajectory, Update
 
 UNUSUAL = ("unmeasured", "unranked", "implausible")
 """What trajectories may be that is an event of the log when it begins and when it ends. Commands
@@ -110,8 +108,18 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         watched, samples = found.watched, found.samples
         assert watched is not None
         last = int(samples.times[-1])
-        for number in range(len(watched.alarms)):
-            self._alarm(found, watched, number)
+        for alarm in watched.alarms:  # with its cause, which is known at once
+            shares = alarm.probability, alarm.shares.get(UNKNOWN, 0.0), alarm.shares
+            self.log(
+                "alarm",
+                last,
+                sample=alarm.number,
+                begin=int(samples.times[0]),
+                output=f"trajectory {alarm.number + 1}",
+                change="unlike the healthy machine" + ", with commands outside" * alarm.outside,
+                evidence=alarm.evidence,
+                cause=cause_data(alarm.name, *shares),
+            )
         if watched.void[-1] and not self.void:
             self.log("void", last)
         remark = next((i for i, name in enumerate(UNUSUAL, 1) if getattr(watched, name)[-1]), 0)
@@ -167,27 +175,6 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         """Scores of the newest trajectories, which are standard Gaussian for a healthy machine."""
         times, score, evidence = np.array(self._recent, dtype=object).reshape(-1, 3).T
         values = score.astype(float)[:, None]
-        return Recent(
-            times.astype(np.int64),
-            np.zeros((len(times), 0)),
-            values,
-            np.zeros_like(values),
-            np.ones_like(values),
-            evidence.astype(float),
-        )
-
-    def _alarm(self, found: Diagnosed, watched: WatchedTrajectories, number: int) -> None:
-        """Log an alarm with its cause, which is known at once."""
-        alarm, times = watched.alarms[number], found.samples.times
-        unknown = alarm.shares.get(UNKNOWN, 0.0)
-        cause = cause_data(alarm.name, alarm.probability, unknown, alarm.shares)
-        self.log(
-            "alarm",
-            int(times[-1]),
-            sample=alarm.number,
-            begin=int(times[0]),
-            output=f"trajectory {alarm.number + 1}",
-            change="unlike the healthy machine" + ", with commands outside" * alarm.outside,
-            evidence=alarm.evidence,
-            cause=cause,
-        )
+        whole, commands = times.astype(np.int64), values[:, :0]
+        standard = np.zeros_like(values), np.ones_like(values)
+        return Recent(whole, commands, values, *standard, evidence.astype(float))

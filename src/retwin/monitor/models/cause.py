@@ -16,7 +16,7 @@ from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.inversion.fault_evidence import FaultEvidence
 from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.monitor.models.watched import Alarm
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.twins.faults.actuator_faults import Fault, ends_of
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
@@ -48,9 +48,6 @@ GROWTH = 0.25
 
 AT_LIMIT = 0.02
 """Share of the range of a fault's size within which its interval is at an end of it."""
-
-PARTS = ("value", "low", "high")
-"""Of an estimate."""
 
 
 @dataclass(frozen=True)
@@ -95,24 +92,20 @@ class Cause:
     limit: bool = False
 
 
-def cause_title(name: str) -> str:
-    """A cause as it is shown: an alarm that the healthy class explains best has no known cause."""
-    return "no known fault" if name == HEALTHY else name
-
-
 def cause_text(cause: Mapping[str, Any], since: str) -> str:
     """A cause with its onset, size and probability, and whether there is more to it.
 
     Of a `Cause` as a mapping, or of `cause_data`; `since` is its onset, "" where that is not known.
     """
-    more = cause["unknown"] > PROBABLE and cause["name"] != HEALTHY
-    text = cause_title(cause["name"]) + (f" from {since}" if since else "")
+    known = cause["name"] != HEALTHY  # else it explains the alarm best, which has no known cause
+    more = cause["unknown"] > PROBABLE and known
+    text = (cause["name"] if known else "no known fault") + (f" from {since}" if since else "")
     text += ", and more than that" if since and more else ""
     value, low, high = cause["size"]
     of = f" {cause['unit']}" if cause["unit"] not in ("", "1") else ""
-    known = value is not None and np.isfinite(value)
     end = " at the end of its range" if cause["limit"] else ""
-    size = f"size {value:.3g}{of} ({low:.3g} to {high:.3g}){end}, " if known else ""
+    sized = value is not None and np.isfinite(value)
+    size = f"size {value:.3g}{of} ({low:.3g} to {high:.3g}){end}, " if sized else ""
     among = " among the known causes" if more else ""
     return f"{text}; {size}probability {cause['probability']:.2f}{among}"
 
@@ -261,10 +254,8 @@ def find_causes(
     whole("before", before, at_least=MIN_WINDOW)
     ids, found = record.ids.tolist(), list[Cause]()
     newest, inferred = dict[str, Alarm](), dict[tuple[str, int], list[Alarm]]()
-    current, latest = dict[tuple[str, int], Cause](), dict[tuple[str, int], Cause]()
-    for number, alarm in enumerate(alarms):
-        if progress is not None:
-            progress(number / len(alarms))
+    current, latest = dict[tuple[str, int], tuple[str, float]](), dict[tuple[str, int], Cause]()
+    for alarm in tracked(alarms, len(alarms), progress):
         require(
             alarm.trajectory in ids and alarm.sample < record.steps,
             "alarms",
@@ -278,19 +269,14 @@ def find_causes(
         newest[alarm.trajectory] = alarm
         if is_due([each.sample for each in known if each.event == alarm.event], alarm.sample):
             known.append(alarm)
-            latest[event] = find_cause(
-                twin,
-                record[[ids.index(alarm.trajectory)]],
-                known,
-                faults,
-                before,
-                current=current[event].name if event in current else "",
-                unexplained=current[event].unknown if event in current else 0.0,
-                known_start=known_start,
+            own, has = record[[ids.index(alarm.trajectory)]], current.get(event, ("", 0.0))
+            cause = find_cause(
+                twin, own, known, faults, before, current=has, known_start=known_start
             )
-            if not latest[event].same or latest[event].name == current[event].name:
-                current[event] = latest[event]
-            found.append(latest[event])
+            latest[event] = cause
+            if not cause.same or cause.name == has[0]:
+                current[event] = cause.name, cause.unknown
+            found.append(cause)
         else:
             found.append(replace(latest[event], alarm=alarm, same=True))
     return found
@@ -322,8 +308,7 @@ def find_cause(
     faults: Mapping[str, Fault | None],
     before: int = BEFORE,
     *,
-    current: str = "",
-    unexplained: float = 0.0,
+    current: tuple[str, float] = ("", 0.0),
     known_start: bool = True,
 ) -> Cause:
     """The cause of the last of a trajectory's alarms, see `find_causes`.
@@ -337,11 +322,10 @@ def find_cause(
     alarms : sequence of Alarm
         The newest one before the event, if any, and those of the event at which its cause is
         inferred.
-    current : str
-        The cause that the event has; "" for none.
-    unexplained : float
-        Probability that there was something besides. It is also that of a cause which explains
-        the newest samples alone: in few of them each cause seems to.
+    current : tuple of str and float
+        The cause that the event has, "" for none, and the probability that there was something
+        besides. It is also that of a cause which explains the newest samples alone: in few of them
+        each cause seems to.
 
     """
     alarm, own = alarms[-1], [each for each in alarms if each.event == alarms[-1].event]
@@ -362,8 +346,8 @@ def find_cause(
     whole = infer(start) if alarm.sample - opening <= before else None
     begin = max(0, own[-2].sample + 1, alarm.sample - before)
     cause = whole if whole is not None and likely(whole) else infer(begin)
-    same = cause.name in (current, HEALTHY) or not likely(cause)
-    known = faults.get(current)
+    same = cause.name in (current[0], HEALTHY) or not likely(cause)
+    known = faults.get(current[0])
     if not same and isinstance(known, TimedFault):
         both = known, faults[cause.name]
         window = max(start, alarm.sample - EVENT), begin, alarm
@@ -371,7 +355,7 @@ def find_cause(
     if whole is not None and same:
         cause = whole
     elif cause is not whole:
-        cause = replace(cause, unknown=max(cause.unknown, unexplained))
+        cause = replace(cause, unknown=max(cause.unknown, current[1]))
     return replace(cause, same=same)
 
 
@@ -392,7 +376,7 @@ def _infer(
     best = int(made.probabilities[0].argmax())
 
     def interval(estimate: Estimate) -> tuple[float, float, float]:
-        value, low, high = (getattr(estimate, part)[0, best] for part in PARTS)
+        value, low, high = (getattr(estimate, part)[0, best] for part in ("value", "low", "high"))
         return float(value), float(low), float(high)
 
     onset = interval(made.onset)

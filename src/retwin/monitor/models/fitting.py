@@ -89,7 +89,10 @@ def fit_monitor(
         sensor gives.
 
     """
-    model = _black_box(healthy) if twin is None else twin
+    model: object = twin
+    if twin is None:
+        known = len(healthy.inputs) > 0
+        model = fit_black_box(healthy, "arx").twin if known else fit_levels(healthy)
     twin = instance("twin", model, DynamicsTwin, remedy="fit it by fit_dynamics")
     check_channels(twin, healthy, "healthy")
     check_magnitude("healthy", healthy)
@@ -128,13 +131,6 @@ def fit_monitor(
     predictors = tuple(each.predictor for each in found)
     more = (noise, Tried(*pairs), lasting, float(alpha), predictors)
     return Monitor(twin, disturbance, scores, slack, steps, arl, *more)
-
-
-def _black_box(healthy: Trajectories) -> object:
-    """What stands for a twin where there is none."""
-    if len(healthy.inputs):
-        return fit_black_box(healthy, "arx").twin
-    return fit_levels(healthy)
 
 
 @dataclass(frozen=True, eq=False)

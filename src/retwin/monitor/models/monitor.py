@@ -31,10 +31,8 @@ from retwin.monitor.detect.scores import ConformalScores, middle
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.detect.validity import Validity
 from retwin.monitor.models.monitor_state import MonitorState
-from retwin.monitor.models.parts import Part, Streams
-from retwin.monitor.models.saved import read_fields, write_fields
-from retwin.monitor.models.visible import Visible
-from retwin.monitor.models.watched import Alarm, Ending, Watched
+from retwin.monitor.models.saved import DISTURBANCE, read_fields, write_fields
+from retwin.monitor.models.watched import Alarm, Ending, Part, Visible, Watched
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.filter.online import OnlineFilter
 from retwin.update.dynamics.twin import BEYOND, DynamicsTwin
@@ -124,12 +122,12 @@ class Monitor:
 
     def start(self, count: int) -> MonitorState:
         """What is known of so many machines before their first sample."""
-        streams = self._streams(count)
+        disturbance, validity = self._streams(count)
         return MonitorState(
             tuple(each.start(count) for each in self._filters),
-            streams.disturbance.start(),
-            streams.detector.start(count * len(self.slack)),
-            streams.validity.start(count * len(self.slack)),
+            disturbance.start(),
+            validity.detector.start(count * len(self.slack)),
+            validity.start(count * len(self.slack)),
             Course.start(count),
             np.zeros((count, len(DECAYS), len(self.twin.inputs))),
             np.zeros((count * len(self.slack), 2)),
@@ -212,22 +210,16 @@ class Monitor:
         """What is found in samples (n, T, ...) if none of the machines begins anew in them."""
         count, samples = measured.shape[:2]
         seen, learn = np.isfinite(measured), state.course.event < 0
-        predicted = [
-            online.step(own, commands, measured, seen, learn)
-            for online, own in zip(self._filters, state.filters, strict=True)
-        ]
-        pairs = zip(
-            *(
-                standardised(measured - mean, covariance, seen, self.resolution)
-                for _, mean, covariance in predicted
-            ),
-            strict=True,
-        )
+        models = zip(self._filters, state.filters, strict=True)
+        found = [online.step(own, commands, measured, seen, learn) for online, own in models]
+        filtered, means, covariances = zip(*found, strict=True)
+        predicted = zip(means, covariances, strict=True)
+        both = [standardised(measured - at, own, seen, self.resolution) for at, own in predicted]
+        pairs = zip(*both, strict=True)
         error, width = (by_stream(np.concatenate(each, axis=2)) for each in pairs)
-        streams = self._streams(count)
-        disturbance, error, scale = streams.disturbance.run(state.disturbance, error)
-        _, mean, covariance = predicted[0]
-        before, level = state.filters[0].commands[:, -1], np.nan_to_num(mean)
+        model, validity = self._streams(count)
+        disturbance, error, scale = model.run(state.disturbance, error)
+        before, level = state.filters[0].commands[:, -1], np.nan_to_num(means[0])
         changes, noted = features(state.changes, before, commands, level, span_of(self.twin))
         shift, spread = (by_stream(each) for each in self.noise.run(noted))
         error, width = (error - shift) / spread, width / scale / spread
@@ -242,7 +234,7 @@ class Monitor:
         used = np.stack([each.used(since, samples, rate) for each in self.predictors], axis=1)
         used = np.repeat(used, len(self.twin.outputs), axis=1).reshape(low.shape)
         low, high = (np.where(used, each, np.nan) for each in (low, high))
-        detector, evidence = streams.detector.run(state.detector, low, high)
+        detector, evidence = validity.detector.run(state.detector, low, high)
         total = evidence.reshape(count, len(self.slack), -1).mean(axis=1)
         counted = np.isfinite(low).reshape(count, len(self.slack), -1).any(axis=1)
         rules = self.rules
@@ -252,30 +244,24 @@ class Monitor:
             change = state.course.change + [[len(self.slack), 0]] * np.arange(count)[:, None]
             given = state.course.end_evidence, change, state.detector.previous
             end_evidence = np.where(
-                learn[:, None], end_evidence, streams.detector.evidence_of_end(*given, low, high)
+                learn[:, None], end_evidence, validity.detector.evidence_of_end(*given, low, high)
             )
         ended = rules.ends(state.course, total, end_evidence, counted) & ~alarm
         outside = self._outside(commands)
         changed = rules.changes(state.course, samples) & ~ended
-        filters = tuple(
-            finite_state(online, filtered)
-            for online, (filtered, _, _) in zip(self._filters, predicted, strict=True)
-        )
-        stays_finite = np.all(
-            [np.isfinite(each).all(axis=(1, 2)) for _, each, _ in predicted], axis=0
-        )
+        stays_finite = np.all([np.isfinite(each).all(axis=(1, 2)) for each in means], axis=0)
         after = replace(
             state,
-            filters=filters,
+            filters=tuple(map(finite_state, self._filters, filtered)),
             disturbance=disturbance,
             detector=detector,
             changes=changes,
             scale=sums,
             void=state.void | ~stays_finite,
         )
-        deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
+        deviation = np.sqrt(np.diagonal(covariances[0], axis1=2, axis2=3))
         flags = alarm, ended, changed, counted, outside
-        return Part(after, mean, deviation, low, high, evidence, total, end_evidence, *flags)
+        return Part(after, means[0], deviation, low, high, evidence, total, end_evidence, *flags)
 
     def _after(
         self,
@@ -294,8 +280,8 @@ class Monitor:
         low, high = (np.where(calm, own, np.nan) for own in (part.low, part.high))
         flags = np.zeros(low.shape, dtype=bool)
         flags[:, -1] = np.repeat(opens & ~part.outside[:, -1], each)
-        streams = self._streams(len(alarm))
-        validity, against = streams.validity.run(state.validity, flags, low, high)
+        test = self._streams(len(alarm))[1]
+        validity, against = test.run(state.validity, flags, low, high)
         broken = against.reshape(len(alarm), each, -1).mean(axis=1) >= 1 / self.alpha
         void = np.logical_or.accumulate(broken, axis=1) | after.void[:, None]
         lasts = np.repeat((course.event >= 0)[:, None], void.shape[1], axis=1)
@@ -303,7 +289,7 @@ class Monitor:
         rows = np.arange(len(alarm))
         most = part.evidence[:, -1].reshape(-1, each).argmax(axis=1)
         weighed = after.detector.evidence.reshape(len(alarm), each, -1)[rows, most]
-        change = np.stack([most, (weighed * streams.detector.bets.weights).argmax(axis=1)], axis=1)
+        change = np.stack([most, (weighed * test.detector.bets.weights).argmax(axis=1)], axis=1)
         ends = part.counted, alarm, ended, changed, change, part.end_evidence[:, -1]
         course = self.rules.after(course, *ends)
         for machine in np.flatnonzero(alarm):
@@ -316,7 +302,7 @@ class Monitor:
                     sample,
                     sample / self.twin.rate,
                     outputs[stream % len(outputs)],
-                    streams.detector.change(number),
+                    test.detector.change(number),
                     float(part.total[machine, -1]),
                     sample if opens[machine] else int(state.course.event[machine]),
                     not (void[machine, -1] or part.outside[machine, -1]),
@@ -337,11 +323,11 @@ class Monitor:
         self, state: MonitorState, anew: NDArray, ended: NDArray, changed: NDArray
     ) -> MonitorState:
         """The state where filter and detector begin anew; after a change with another machine."""
-        streams, each = self._streams(len(anew)), len(self.slack)
-        detector = streams.detector.reset(state.detector, np.repeat(anew | ended, each))
+        (model, validity), each = self._streams(len(anew)), len(self.slack)
+        detector = validity.detector.reset(state.detector, np.repeat(anew | ended, each))
         if not anew.any():
             return replace(state, detector=detector)
-        rows, first = np.flatnonzero(anew), streams.disturbance.start()
+        rows, first = np.flatnonzero(anew), model.start()
         filters = []
         for online, own in zip(self._filters, state.filters, strict=True):
             new, old = online.start(len(rows)), own.of(rows)
@@ -359,11 +345,7 @@ class Monitor:
             np.where(where[:, None, None], first.covariance, state.disturbance.covariance),
         )
         return replace(
-            state,
-            filters=tuple(filters),
-            disturbance=disturbance,
-            detector=detector,
-            scale=scale,
+            state, filters=tuple(filters), disturbance=disturbance, detector=detector, scale=scale
         )
 
     def _held(self, state: MonitorState, commands: NDArray) -> NDArray:
@@ -394,14 +376,17 @@ class Monitor:
         return tuple(each.filter(self.twin) for each in self.predictors)
 
     @cached_property
-    def _by_count(self) -> dict[int, Streams]:
-        """The parts for each number of machines that was used: their tables take long to make."""
+    def _by_count(self) -> dict[int, tuple[Disturbance, Validity]]:
+        """See `_streams`, for each number of machines that was used: tables take long to make."""
         return {}
 
-    def _streams(self, count: int) -> Streams:
+    def _streams(self, count: int) -> tuple[Disturbance, Validity]:
+        """The models for the outputs of so many machines, those of the first one first."""
         if count not in self._by_count:
-            validity = Validity(Detector(self.slack), self.run_length, self.alpha)
-            self._by_count[count] = Streams.of(self.disturbance, validity, count)
+            known = {name: getattr(self.disturbance, name) for name in DISTURBANCE}
+            repeated = {name: np.concatenate([each] * count) for name, each in known.items()}
+            validity = Validity(Detector(self.slack * count), self.run_length, self.alpha)
+            self._by_count[count] = replace(self.disturbance, **repeated), validity
         return self._by_count[count]
 
     def save(self, folder: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""`MonitorState`: what a monitor remembers of the machines that it watches, as arrays to keep."""
+"""`MonitorState`: what a monitor remembers of machines, as arrays or as rows of numbers to keep."""
 
 from __future__ import annotations
 
@@ -79,6 +79,45 @@ class MonitorState:
             part_of(ValidityState, "validity", rows),
             part_of(Course, "course", rows),
             *(rows[name] for name in ("changes", "scale", "void")),
+        )
+
+
+class Layout:
+    """The states of machines of one monitor as rows (n, K) of numbers.
+
+    Parameters
+    ----------
+    start : MonitorState
+        That of one machine, before its first sample.
+    digest : str
+        The hexadecimal hash of its files: its states are of no use to another one.
+
+    """
+
+    def __init__(self, start: MonitorState, digest: str = "") -> None:
+        self.digest = np.frombuffer(bytes.fromhex(digest), dtype=np.uint8)
+        arrays = start.arrays()
+        self._parts = {name: (each.dtype, each.shape[1:]) for name, each in arrays.items()}
+        self._ends = np.cumsum([each[0].size for each in arrays.values()])
+        self.start = self.rows(start)[0]
+        """(K,), the state before the first sample."""
+
+    def rows(self, state: MonitorState) -> NDArray:
+        """The rows (n, K) of a state."""
+        arrays = state.arrays()
+        count = len(state.void)
+        # Whole numbers and truth values are exact as floats.
+        flat = [arrays[name].reshape(count, -1).astype(float) for name in self._parts]
+        return np.concatenate(flat, axis=1)
+
+    def state(self, rows: NDArray) -> MonitorState:
+        """The state of rows (n, K)."""
+        parts = np.split(rows, self._ends[:-1], axis=1)
+        return MonitorState.of_arrays(
+            {
+                name: part.reshape(-1, *shape).astype(dtype)
+                for (name, (dtype, shape)), part in zip(self._parts.items(), parts, strict=True)
+            }
         )
 
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Mapping
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -18,8 +20,8 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.models.cause import size_unit
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.visible import SHARE, Visible
-from retwin.progress import Progress
+from retwin.monitor.models.watched import SHARE, Visible
+from retwin.progress import Progress, tracked
 from retwin.twins.collected import SimulationError
 from retwin.twins.faults.actuator_faults import Fault, Stuck
 from retwin.twins.faults.system_faults import (
@@ -73,28 +75,33 @@ def visible_sizes(
     windows = _windows(monitor, healthy)
     within = (windows.steps - windows.lead) / healthy.rate
     made = []
-    for number, (name, fault) in enumerate(faults.items()):
-        if progress:
-            progress(number / len(faults))
+    for name, fault in tracked(faults.items(), len(faults), progress):
         if not isinstance(fault, TimedFault | Stuck):
             continue
-        largest = _largest(fault)
+        ends = np.atleast_1d(fault.size).tolist() if isinstance(fault, SizedFault) else []
+        largest = max(ends, key=abs, default=None)
         sizes = [None] if largest is None else [largest / 2**i for i in range(HALVINGS + 1)]
-        best, share = None, _share(monitor, windows, fault, sizes[0])
-        if share >= SHARE:
-            best, unseen = sizes[0], sizes[1:]  # larger sizes are seen, smaller ones are not
-            while unseen:
-                middle = len(unseen) // 2
-                now = _share(monitor, windows, fault, unseen[middle])
-                if now >= SHARE:
-                    best, share, unseen = unseen[middle], now, unseen[middle + 1 :]
-                else:
-                    unseen = unseen[:middle]
+        best, share = _smallest(sizes, partial(_share, monitor, windows, fault))
         if np.isfinite(share):  # of a fault that the twin can simulate
             unit = size_unit(fault, monitor.twin)
             value = _value_behind(fault, monitor.twin)
             made.append(Visible(name, best, largest, share, within, unit, value))
     return made
+
+
+def _smallest(
+    sizes: Sequence[float | None], share: Callable[[float | None], float]
+) -> tuple[float | None, float]:
+    """The smallest of sizes that is seen, of which the largest is first, and its share.
+
+    None where the largest one is not seen, with the share of that one.
+    """
+    known = cache(share)
+    if not known(sizes[0]) >= SHARE:
+        return None, known(sizes[0])
+    # Larger sizes are seen, smaller ones are not.
+    unseen = bisect_left(sizes, True, lo=1, key=lambda size: not known(size) >= SHARE)
+    return sizes[unseen - 1], known(sizes[unseen - 1])
 
 
 def _value_behind(fault: Fault | None, twin: DynamicsTwin) -> float | None:
@@ -137,13 +144,6 @@ def _windows(monitor: Monitor, healthy: Trajectories) -> _Windows:
     even = np.linspace(0, len(starts) - 1, min(ONSETS, len(starts)))
     chosen = np.array(starts)[even.round().astype(int)]
     return _Windows(healthy, chosen[:, 0], chosen[:, 1], lead, steps)
-
-
-def _largest(fault: TimedFault | Stuck) -> float | None:
-    """The size of a fault that is farthest from 0."""
-    if not isinstance(fault, SizedFault):
-        return None
-    return float(max(np.atleast_1d(fault.size), key=abs))
 
 
 def _share(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import to_jsonable_python
+from starlette.exceptions import HTTPException
 
 from retwin._version import __version__
 from retwin.checks import at_most, needs_extra
@@ -21,12 +22,12 @@ from retwin.errors import InputError
 from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.gate import Gate
 from retwin.monitor.live.live import Live
-from retwin.monitor.live.status import Received
-from retwin.monitor.server.comparison import Comparisons
+from retwin.monitor.live.machine import Received
 from retwin.monitor.server.guard import RequestGuard
 from retwin.monitor.server.metrics import Metrics
 from retwin.monitor.server.views import Views
 from retwin.monitor.store.samples import parse
+from retwin.monitor.versions.comparison import Comparisons
 from retwin.monitor.versions.decision import Decision
 from retwin.monitor.versions.registry import Registry
 from retwin.report.figures.style import CHROME, PALETTE
@@ -158,9 +159,7 @@ def _report_errors(app: fastapi.FastAPI) -> None:
 
     app.add_exception_handler(InputError, refused)
     app.add_exception_handler(fastapi.exceptions.RequestValidationError, invalid)
-    app.add_exception_handler(404, unknown)
-    app.add_exception_handler(405, unknown)
-    app.add_exception_handler(fastapi.HTTPException, unknown)
+    app.add_exception_handler(HTTPException, unknown)
 
 
 def _add_page(app: fastapi.FastAPI) -> None:

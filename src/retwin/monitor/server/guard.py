@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import hmac
-import json
 import threading
 from collections.abc import Collection
 from typing import Any
 from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse
 
 MAX_BODY = 2**22
 """Bytes of a request's body at most."""
@@ -58,28 +60,31 @@ class RequestGuard:
             if scope["type"] == "lifespan":
                 await self._app(scope, receive, send)
             return
-        headers = dict(scope["headers"])
         answered = _dressed(send)
-        refused = self._refused(scope["method"], headers)
+        refused = self._refused(scope["method"], Headers(scope=scope))
         if refused is None and scope["method"] not in READING:
             body = await _body(receive)
             if isinstance(body, bytes):
                 receive = _again(body, receive)
             else:
                 refused = body
-        if refused is None:
-            await self._app(scope, receive, answered)
-        else:
-            await _answer(answered, *refused)
+        answer = self._app
+        if refused is not None:
+            status, error = refused
+            headers = {"connection": "close"}
+            if status == 401:
+                headers["www-authenticate"] = "Bearer"
+            answer = JSONResponse({"error": error}, status, headers)
+        await answer(scope, receive, answered)
 
-    def _refused(self, method: str, headers: dict[bytes, bytes]) -> tuple[int, str] | None:
-        if _name(headers.get(b"host", b"")) not in self._hosts:
+    def _refused(self, method: str, headers: Headers) -> tuple[int, str] | None:
+        if _name(headers.get("host", "")) not in self._hosts:
             return 421, "host: expected a name of this server; add it to `hosts`"
         if method in READING:
             return None
-        if not hmac.compare_digest(headers.get(b"authorization", b""), self._token):
+        if not hmac.compare_digest(headers.get("authorization", "").encode(), self._token):
             return 401, "authorization: expected the token of this server, as Bearer TOKEN"
-        length = headers.get(b"content-length", b"0")
+        length = headers.get("content-length", "0")
         if not length.isdigit() or len(length) > 12 or int(length) > MAX_BODY:
             return LARGE
         return None
@@ -120,28 +125,17 @@ def _dressed(send: Any) -> Any:
 
     async def sent(message: Any) -> None:
         if message["type"] == "http.response.start":
-            own = {name for name, _ in message.get("headers", ())}
-            more = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-            message["headers"] = [
-                *message.get("headers", ()),
-                *(each for each in more if each[0] not in own),
-            ]
+            headers = MutableHeaders(scope=message)
+            for name, value in HEADERS.items():
+                headers.setdefault(name, value)
         await send(message)
 
     return sent
 
 
-async def _answer(send: Any, status: int, error: str) -> None:
-    headers = [(b"content-type", b"application/json"), (b"connection", b"close")]
-    if status == 401:
-        headers.append((b"www-authenticate", b"Bearer"))
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": json.dumps({"error": error}).encode()})
-
-
-def _name(host: bytes) -> str:
+def _name(host: str) -> str:
     """The name in a Host header, without its port; "" if it is none."""
     try:
-        return (urlsplit(f"//{host.decode('ascii')}").hostname or "").lower()
+        return (urlsplit(f"//{host}").hostname or "").lower()
     except ValueError:
         return ""

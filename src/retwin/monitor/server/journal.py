@@ -107,13 +107,9 @@ class Journal:
                 self._opened[entry.sequence] = event["sequence"]
                 event["alarms"] += 1
         elif entry.kind in ("alarm", "remark", "void", "event"):
-            require(
-                {"asset", "time"} <= data.keys(),
-                f"entry {entry.sequence} of the log",
-                expected="an asset and a time",
-                got=", ".join(data),
-                remedy="verify the log",
-            )
+            where, got = f"entry {entry.sequence} of the log", ", ".join(data)
+            known, expected = {"asset", "time"} <= data.keys(), "an asset and a time"
+            require(known, where, expected=expected, got=got, remedy="verify the log")
             made = {**data, "kind": entry.kind, "sequence": entry.sequence}
             made["time"] = data["time"] / SECOND
             if entry.kind == "alarm":

@@ -58,9 +58,8 @@ class Metrics:
                 samples.add_metric([each.asset, result], count)
             alarms.add_metric([each.asset], each.alarms)
             gauges["evidence_ratio"].add_metric([each.asset], each.ratio)
-            gauges["event"].add_metric([each.asset], each.event)
-            gauges["void"].add_metric([each.asset], each.void)
-            gauges["outside"].add_metric([each.asset], each.outside)
+            for name in ("event", "void", "outside"):
+                gauges[name].add_metric([each.asset], getattr(each, name))
             if each.time is not None:
                 gauges["newest_sample_seconds"].add_metric([each.asset], each.time / 1e9)
         up = GaugeMetricFamily(

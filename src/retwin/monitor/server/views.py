@@ -5,27 +5,33 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from retwin.checks import given, require
-from retwin.data.trajectories import Channels
+from retwin.data.trajectories import HEALTHY
 from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.live import Live
-from retwin.monitor.live.machine import Recent
-from retwin.monitor.live.status import AssetStatus
+from retwin.monitor.live.machine import AssetStatus, Recent
 from retwin.monitor.models.cause import possible_causes
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor, pace
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
-from retwin.monitor.server.checks import what_to_check
 from retwin.monitor.server.journal import Journal
 from retwin.monitor.store.gridded import gridded
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.versions.registry import Registry
+from retwin.twins.faults.system_faults import (
+    ActuatorGain,
+    ParameterDrift,
+    ParameterShift,
+    SensorBias,
+    SensorDrift,
+    SensorFreeze,
+)
 from retwin.update.dynamics.filter.noise import CERTAIN
 
 SILENT = 20
@@ -90,7 +96,8 @@ class Views:
         got, remedy = repr(name)[:80], "see /assets"
         status = given("asset", found, "one that is watched", got=got, remedy=remedy)
         monitor, twins = self._live.monitor(name), self._twins()
-        recent = self._live.recent(name)
+        scores, recent = isinstance(monitor, TrajectoryMonitor), self._live.recent(name)
+        names = ([], [("score", "1")]) if scores else _channels(monitor.twin)
         times = recent.times / SECOND
         new = slice(0 if after is None else int(np.searchsorted(times, after, "right")), None)
         return {
@@ -99,14 +106,14 @@ class Views:
             "run_length": getattr(monitor, "run_length", monitor.arl),
             "tried": tried(monitor),
             "rate": pace(monitor),
-            "kind": "scores" if isinstance(monitor, TrajectoryMonitor) else "samples",
+            "kind": "scores" if scores else "samples",
             "promise": {name: str(each) for name, each in monitor.promises.items()},
             "events": [
                 self._explained(each, twins) if each["kind"] == "alarm" else each
                 for each in self.journal.events(name)
             ],
             "evidence": recent.evidence[new].tolist(),
-            **_drawn(*_channels(monitor), recent, new),
+            **_drawn(*names, recent, new),
         }
 
     def around(self, sequence: int) -> dict[str, Any]:
@@ -135,9 +142,8 @@ class Views:
                 mean = monitor.twin.simulate(commands[None], seed=0).nominal[0]
         recent = Recent(times, commands, measured, mean, deviation, np.zeros(len(times)))
         shown = 0 if whole else int(np.searchsorted(times, moment - round(SHOWN * period)))
-        names = _named(monitor.twin.inputs), _named(monitor.twin.outputs)
-        kind = "trajectory" if whole else "samples"
-        return {"kind": kind, **_drawn(*names, recent, slice(shown, None))}
+        kind, drawn = "trajectory" if whole else "samples", slice(shown, None)
+        return {"kind": kind, **_drawn(*_channels(monitor.twin), recent, drawn)}
 
     def alarms(self, asset: str | None, before: int | None, limit: int) -> dict[str, Any]:
         """A page of alarms, the newest first."""
@@ -218,11 +224,10 @@ def tried(monitor: AnyMonitor) -> dict[str, Any] | None:
     return {**counts, "run_length": found.run_length}
 
 
-def _channels(monitor: AnyMonitor) -> tuple[Named, Named]:
-    """The commands and outputs that are drawn; of trajectories their score alone."""
-    if isinstance(monitor, TrajectoryMonitor):
-        return [], [("score", "1")]
-    return _named(monitor.twin.inputs), _named(monitor.twin.outputs)
+def _channels(twin: Any) -> tuple[Named, Named]:
+    """The commands and outputs."""
+    inputs, outputs = (zip(e.names, e.units, strict=True) for e in (twin.inputs, twin.outputs))
+    return list(inputs), list(outputs)
 
 
 def _drawn(inputs: Named, outputs: Named, recent: Recent, part: slice) -> dict[str, Any]:
@@ -246,5 +251,55 @@ ORDER = ("alarm", "void", "impossible", "stopped", "rate", "outside", "ok")
 """The states of assets, the worst first."""
 
 
-def _named(channels: Channels) -> Named:
-    return list(zip(channels.names, channels.units, strict=True))
+SENTENCES: Mapping[type, Callable[[Any, AnyMonitor], str]] = {
+    ParameterShift: lambda fault, monitor: (
+        "The machine has changed. Look for something that is open, leaks, is clogged, worn, loose "
+        f"or was replaced. Details: parameter {fault.parameter} of the twin."
+    ),
+    ParameterDrift: lambda fault, monitor: (
+        "The machine changes slowly. Look for what wears, fouls, ages, heats up or loosens, and "
+        f"compare it with earlier records. Details: parameter {fault.parameter} of the twin."
+    ),
+    ActuatorGain: lambda fault, monitor: (
+        f"The machine does not do what the command {_input(fault, monitor)} demands. Check the "
+        "actuator: its supply, its connection, its wear, and whether something limits or overrides "
+        "the command."
+    ),
+    SensorBias: lambda fault, monitor: (
+        f"The sensor of {_output(fault, monitor)} is offset. Compare it with a second instrument, "
+        "and check its mounting, its reference and its calibration."
+    ),
+    SensorDrift: lambda fault, monitor: (
+        f"The error of the sensor of {_output(fault, monitor)} grows with time. Compare it with a "
+        "second instrument now and again later, and check it for dirt, moisture and ageing."
+    ),
+    SensorFreeze: lambda fault, monitor: (
+        f"The sensor of {_output(fault, monitor)} repeats the same value. Check its cable, its bus "
+        "and the program that reads it, and whether its value changes when it must."
+    ),
+}
+NOTHING = (
+    "None of the known faults explains the alarm better than the healthy machine does. Look at the "
+    "samples around it; a single disturbance from outside is possible, and so is a false alarm."
+)
+UNNAMED = (
+    "Compare what the machine does on site with what it is commanded and with what its sensors "
+    "show, and find out what was changed on it."
+)
+"""Where the cause is of another kind."""
+
+
+def what_to_check(name: str, fault: object, monitor: AnyMonitor) -> str:
+    """A sentence or two on what to check first, for the fault that a cause names."""
+    if name == HEALTHY:
+        return NOTHING
+    found = SENTENCES.get(type(fault))
+    return found(fault, monitor) if found else UNNAMED
+
+
+def _input(fault: ActuatorGain, monitor: AnyMonitor) -> str:
+    return monitor.twin.inputs.names[fault.actuator]
+
+
+def _output(fault: SensorBias | SensorDrift | SensorFreeze, monitor: AnyMonitor) -> str:
+    return monitor.twin.outputs.names[fault.output]

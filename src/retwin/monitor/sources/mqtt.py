@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from retwin.checks import needs_extra, one_of
-from retwin.errors import InputError, brief
+from retwin.errors import InputError
 from retwin.monitor.live.gate import Gate
 from retwin.monitor.settings import MqttSource, secret
 from retwin.monitor.sources.source import Source
 from retwin.monitor.store.samples import Samples, Trajectory, parse
+from retwin.serialisation.files import refusing
 
 KEEPALIVE = 10
 """Seconds without a word from the broker after which it is asked whether it is there."""
@@ -155,15 +156,9 @@ class Mqtt(Source):
 
 def _encryption(settings: MqttSource) -> ssl.SSLContext:
     """Which brokers are trusted, and who the monitor is; InputError if a file cannot be used."""
-    try:
+    remedy = "give the files that the broker's administrator made"
+    with refusing("sources.ca_file", expected="certificates and a key as PEM files", remedy=remedy):
         made = ssl.create_default_context(cafile=settings.ca_file)
         if settings.cert_file is not None:
             made.load_cert_chain(settings.cert_file, settings.key_file)
-    except (OSError, ValueError) as error:  # an SSLError is an OSError
-        raise InputError(
-            "sources.ca_file",
-            expected="certificates and a key as PEM files",
-            got=brief(error),
-            remedy="give the files that the broker's administrator made",
-        ) from None
-    return made
+        return made

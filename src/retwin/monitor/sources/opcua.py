@@ -3,20 +3,93 @@
 from __future__ import annotations
 
 import asyncio
+import bisect
 import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-from retwin.checks import needs_extra, require, same_names
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import existing, needs_extra, require, same_names
 from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
 from retwin.monitor.live.gate import Gate
 from retwin.monitor.settings import OpcUaSource, secret
-from retwin.monitor.sources.assembly import Assembly
 from retwin.monitor.sources.source import AGAIN, Source
 from retwin.monitor.store.samples import Samples
+from retwin.serialisation.files import refusing
+
+
+@dataclass
+class _Group:
+    """Values of one moment: its time in ns, when its first one arrived in s, and each channel's."""
+
+    time: int
+    arrived: float
+    values: dict[int, float] = field(default_factory=dict)
+
+
+class Assembly:
+    """Puts values whose times differ by less than half a sample period together.
+
+    A channel that reports changes alone keeps its value until the next one, and the first samples
+    wait until each channel has one. A value that arrives after the sample of its time was taken
+    makes another one of that time.
+
+    Parameters
+    ----------
+    channels : int
+        Number of channels.
+    period : float
+        Sample period in s.
+    settle : float
+        Time in s for which a sample waits for channels that may not have changed.
+
+    """
+
+    def __init__(self, channels: int, period: float, settle: float) -> None:
+        self._near = round(period * 0.5e9)
+        self._settle = settle
+        self._held: list[float | None] = [None] * channels
+        self._reached = [-(2**63)] * channels
+        self._groups: list[_Group] = []
+
+    def hold(self, channel: int, value: float) -> None:
+        """Take the present value of a channel, which is from before the samples."""
+        self._held[channel] = value
+
+    def add(self, channel: int, time: int, value: float, now: float) -> None:
+        """Take a value at a time in ns, NaN if it is missing, which arrived at `now` in s."""
+        self._reached[channel] = max(self._reached[channel], time)
+        for group in reversed(self._groups):
+            if abs(group.time - time) < self._near and channel not in group.values:
+                group.values[channel] = value
+                return
+        group = _Group(time, now, {channel: value})
+        bisect.insort(self._groups, group, key=lambda each: each.time)
+
+    def take(self, now: float) -> tuple[NDArray, NDArray]:
+        """Times (n,) in ns and values (n, channels) of the samples that are complete."""
+        times, rows = [], []
+        while self._groups:
+            group = self._groups[0]
+            complete = min(self._reached) > group.time - self._near
+            if not complete and now - group.arrived < self._settle:
+                break
+            self._groups.pop(0)
+            for channel, value in group.values.items():
+                self._held[channel] = value
+            row = [each for each in self._held if each is not None]
+            if len(row) == len(self._held):
+                times.append(group.time)
+                rows.append(row)
+        values = np.array(rows, dtype=float).reshape(len(rows), len(self._held))
+        return np.array(times, dtype=np.int64), values
+
 
 TIMEOUT = 4.0
 """Seconds in which the server must answer."""
@@ -24,6 +97,8 @@ LONGEST = 1.0
 """Seconds between two publications, at most."""
 QUEUE = 1000
 """Values of a node that the server keeps while the connection is lost."""
+FILES = "give the files that the server's administrator made"
+"""What to do where one cannot be used."""
 MARGIN = 1.5
 """Intervals of publication for which a sample waits for channels that may not have changed."""
 
@@ -67,13 +142,8 @@ class OpcUa(Source):
         self._settings = settings
         for name in ("cert_file", "key_file", "server_file"):
             file = getattr(settings, name)
-            require(
-                file is None or file.is_file(),
-                f"sources.{name}",
-                expected="a file",
-                got=f"{file}, which is none",
-                remedy="give the files that the server's administrator made",
-            )
+            there = file is None or file.is_file()
+            existing(f"sources.{name}", file, there, "a file", remedy=FILES)
         self._password = secret("password of the server", settings.password_env)
         shortest = min(1 / rates[asset] for asset in settings.nodes)
         self._interval = settings.interval or min(shortest / 2, LONGEST)
@@ -131,11 +201,9 @@ class OpcUa(Source):
                 found = [
                     Samples(asset, *each.take(now)) for asset, each in self._assemblies.items()
                 ]
-                new = [each for each in found if len(each.times)]
-                if new:
-                    futures = [gate.send(each) for each in new]
-                    for samples, future in zip(new, futures, strict=True):
-                        await asyncio.to_thread(self.stored, gate, samples, stop, future)
+                sent = [(each, gate.send(each)) for each in found if len(each.times)]
+                for samples, future in sent:
+                    await asyncio.to_thread(self.stored, gate, samples, stop, future)
 
     async def _client(self) -> Any:
         own = self._settings
@@ -157,7 +225,8 @@ class OpcUa(Source):
         tools = needs_extra("asyncua.crypto.uacrypto", "monitor", purpose)
         policies = needs_extra("asyncua.crypto.security_policies", "monitor", purpose)
         x509 = needs_extra("cryptography.x509", "monitor", purpose)
-        try:
+        expected = "a certificate with the URI of the application, and its key, as PEM files"
+        with refusing("sources.cert_file", expected=expected, remedy=FILES):
             names = (await tools.load_certificate(own.cert_file)).extensions
             found = names.get_extension_for_class(x509.SubjectAlternativeName).value
             # A server compares it with the certificate.
@@ -166,13 +235,6 @@ class OpcUa(Source):
             server = own.server_file and tools.CertProperties(own.server_file)
             if own.server_file:
                 await tools.load_certificate(own.server_file)
-        except (OSError, ValueError, IndexError, x509.ExtensionNotFound) as error:
-            raise InputError(
-                "sources.cert_file",
-                expected="a certificate with the URI of the application, and its key, as PEM files",
-                got=brief(error),
-                remedy="give the files that the server's administrator made",
-            ) from None
         policy = getattr(policies, f"SecurityPolicy{own.security}")
         await client.set_security(policy, own.cert_file, own.key_file, None, server)
 
@@ -180,16 +242,10 @@ class OpcUa(Source):
         self.lost(brief(error))
 
     def _node(self, text: str) -> Any:
-        ua = self._asyncua.ua
-        try:
-            return ua.NodeId.from_string(text)
-        except ua.UaError as error:
-            raise InputError(
-                "sources.nodes",
-                expected='addresses of nodes, "ns=2;s=NAME" or "ns=2;i=NUMBER"',
-                got=f"{text!r} ({brief(error)})",
-                remedy="take them from a browser of the server",
-            ) from None
+        expected = 'addresses of nodes, "ns=2;s=NAME" or "ns=2;i=NUMBER"'
+        remedy = "take them from a browser of the server"
+        with refusing(f"sources.nodes: {text!r}", expected=expected, remedy=remedy):
+            return self._asyncua.ua.NodeId.from_string(text)
 
     def _items(self, subscription: Any) -> list[Any]:
         """What the server is asked for: each new value or time of each node."""

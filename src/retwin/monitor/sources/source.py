@@ -6,7 +6,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 
 from retwin.errors import InputError
 from retwin.monitor.live.gate import Gate
@@ -124,11 +124,8 @@ class Source(ABC):
 
 def _finished(future: Future, stop: threading.Event) -> bool:
     """Whether a future has a result; False if it has none some time after `stop` was set."""
-    while True:
-        try:
-            future.result(timeout=0.5)
-        except TimeoutError:
-            if stop.is_set():
-                return False
-        else:
-            return True
+    while not wait([future], timeout=0.5).done:
+        if stop.is_set():
+            return False
+    future.result()
+    return True

@@ -1,10 +1,10 @@
-"""Tables of samples that grow: which rows of a CSV or Parquet file were not read yet."""
+"""Tables of samples that grow: their layouts, and which rows of a file were not read yet."""
 
 from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,18 +12,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.cases.case import Case
+from retwin.cases.columns import ColumnRecords
+from retwin.checks import require, same_names
+from retwin.data.io.assembly import DataCase
 from retwin.data.layout import HEAD, encoding_of, text_layout
 from retwin.data.layout import Layout as TextLayout
-from retwin.data.logs.channels import in_unit, mean_of
+from retwin.data.logs.channels import in_unit, mean_of, table_of
 from retwin.data.logs.formats.arrow_tables import read_table
-from retwin.data.logs.mapping import ChannelMapping
+from retwin.data.logs.mapping import ChannelMapping, Mapping
 from retwin.data.logs.signals import NANOSECOND, Clock, Signal, TimeUnit, named_unit
 from retwin.data.logs.units import same_unit
 from retwin.data.row_times import time_column, times_that_are
 from retwin.data.tables import Table, text_table
-from retwin.errors import InputError, brief
+from retwin.data.trajectories import Channels
+from retwin.errors import brief
+from retwin.monitor.settings import FolderSource
+from retwin.serialisation.files import refusing
 
+REMEDY = "leave it out of the mapping of this source, or write complete logs"
 CHUNK = 2**16
 """Bytes of a CSV file, and of one of its rows, that are read at once."""
 ROWS = 8192
@@ -106,9 +113,8 @@ class Layout:
                 bad += [f"{str(each)[:80]!r} in {table.place}, column {name!r}" for each in text]
                 good &= ~odd
         means = [mean_of([found[each] for each in own], table.place) for own in self.columns]
-        columns = [each.values for each in means]
-        for at, (channel, mean) in enumerate(zip(self.channels, means, strict=False)):
-            columns[at] = _in_unit_of(channel, mean, table.place)
+        pairs = zip(self.channels, means, strict=False)
+        columns = [_in_unit_of(*pair, table.place) for pair in pairs] or [e.values for e in means]
         values = np.stack(columns, axis=1)[good]
         times = times[good[kept]] + self.offset
         self._mask(times, values, since)
@@ -158,6 +164,12 @@ class Rows:
     end: Any
 
 
+def state_of(path: str | Path) -> tuple[int, int, int]:
+    """The number of a file, its size, and the time of its change in ns."""
+    about = os.stat(path)
+    return about.st_ino, about.st_size, about.st_mtime_ns
+
+
 class GrowingTable(ABC):
     """A file of rows that may grow, or be replaced by another one of that name.
 
@@ -179,10 +191,8 @@ class GrowingTable(ABC):
 
     def changed(self) -> bool:
         """Whether the file was written to, or replaced, since this was last called."""
-        about = os.stat(self.path)
-        now = (about.st_ino, about.st_size, about.st_mtime_ns)
-        before, self._seen = self._seen, now
-        return before != now
+        before, self._seen = self._seen, state_of(self.path)
+        return before != self._seen
 
     def rows(self) -> Iterator[Rows]:
         """New rows part by part; after each, set `place` to its end to have read it.
@@ -190,17 +200,10 @@ class GrowingTable(ABC):
         Where the file was replaced or truncated, or its begin was changed, all rows are new again.
         Raises InputError where it is no table, or lacks a column.
         """
-        try:
+        expected = f"a table with columns {', '.join(self.layout.wanted)}"
+        remedy = "correct it, or name the columns as the file does"
+        with refusing(self.path, expected=expected, remedy=remedy):
             yield from self._rows()
-        except InputError:
-            raise
-        except Exception as error:  # of the libraries too, whose classes are many
-            raise InputError(
-                str(self.path),
-                expected=f"a table with columns {', '.join(self.layout.wanted)}",
-                got=f"{type(error).__name__}: {brief(error)}",
-                remedy="correct it, or name the columns as the file does",
-            ) from None
 
     @abstractmethod
     def _rows(self) -> Iterator[Rows]:
@@ -301,3 +304,89 @@ class Parquet(GrowingTable):
             yield own.rows(
                 Table(self.path.name, units, part.stop - begin, some.__getitem__), since, end
             )
+
+
+def layout_of(settings: FolderSource, channels: Sequence[str], case: Case | None) -> Layout:
+    """The columns of the settings, else those of the case's records, else names of the channels.
+
+    Raises
+    ------
+    InputError
+        A channel has no column, or there is another; or the records of the case differ.
+
+    """
+    records = case.records if case is not None else None
+    known = records.every_record if isinstance(records, ColumnRecords) else ()
+    columns = settings.columns or _same(
+        [dict(each.columns) for each in known], "columns", {name: name for name in channels}
+    )
+    remedy = 'write for each channel NAME = "COLUMN"'
+    same_names("sources.columns", columns, channels, "a column for each of", remedy=remedy)
+    clocks = [each.clock for each in known if each.clock is not None]
+    time = settings.time or _same([each.column for each in clocks], "time", "time")
+    unit = settings.unit or _same([each.unit for each in clocks], "unit", "s")
+    several = [columns[name] for name in channels]
+    return Layout(time, unit, tuple((e,) if isinstance(e, str) else tuple(e) for e in several))
+
+
+def mapped_layout(
+    mapping: Mapping, inputs: Channels, outputs: Channels, rate: float, case: DataCase | None
+) -> Layout:
+    """How a mapping is applied to rows as they appear.
+
+    Parameters
+    ----------
+    mapping : Mapping
+        The settings. The class of the log and nominal outputs are of no use in a stream.
+    inputs, outputs : Channels
+        Those of the twin.
+    rate : float
+        Its sample rate in Hz.
+    case : DataCase or None
+        As logs are read with: whether a unit of "1" is one.
+
+    Raises
+    ------
+    InputError
+        The channels are not those of the twin, or a setting needs later rows or a whole log.
+
+    """
+    stated = case is not None and bool(case.classes)
+    commands = table_of(mapping.commands, inputs, "commands", stated=stated)
+    measured = table_of(mapping.outputs, outputs, "outputs", stated=stated)
+    every, cut, time = (*commands, *measured), mapping.cut, mapping.time
+
+    def refuse(wrong: bool, key: str, got: object, expected: str) -> None:
+        require(not wrong, f"mapping: {key}", expected=expected, got=got, remedy=REMEDY)
+
+    other_rate = mapping.rate is not None and not np.isclose(mapping.rate, rate, rtol=1e-6)
+    refuse(other_rate, "rate", mapping.rate, f"that of the twin, {rate:g} Hz, or none")
+    wanted = "a column of times, since a file that is replaced starts again"
+    refuse(time.rate is not None, "time.rate", time.rate, wanted)
+    wanted = "all rows of a stream, of which nothing is left out"
+    refuse(cut.by in ("trigger", "length"), "cut.by", cut.by, wanted)
+    refuse(cut.min_length is not None, "cut.min_length", cut.min_length, wanted)
+    for name, own, _ in commands:
+        wanted = "another one: it is held until the next row, which is not there yet"
+        refuse(own.resample == "linear", f"commands.{name}.resample", own.resample, wanted)
+    for name, own, _ in measured:
+        wanted = "another one for rows as they appear: what was not measured is missing"
+        refuse(own.resample == "hold", f"outputs.{name}.resample", own.resample, wanted)
+    offsets = sorted({own.clock_offset for _, own, _ in every})
+    wanted = "the same for all channels, since a row of a stream has one time; MQTT and OPC UA take"
+    wanted += " channels with clocks of their own"
+    refuse(len(offsets) > 1, "clock_offset", offsets, wanted)
+    columns = tuple(tuple(own.signals) for _, own, _ in every)
+    return Layout(time.column, time.unit, columns, time.format, every, len(commands))
+
+
+def _same(found: list[Any], what: str, default: Any) -> Any:
+    """What all records of a case have in common, or the default where there are none."""
+    require(
+        all(each == found[0] for each in found),
+        f"sources.{what}",
+        expected=f"the {what} of the files",
+        got="none, and records of the case that differ in it",
+        remedy=f"give `{what}` in the source",
+    )
+    return found[0] if found else default

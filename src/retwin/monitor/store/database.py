@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra, nothing, require
+from retwin.checks import existing, needs_extra, nothing, require
 from retwin.errors import InputError, brief
 from retwin.monitor.store.audit import Entry
 
@@ -102,8 +102,6 @@ class Database:
     """
 
     def __init__(self, file: Path, url: str, *, read_only: bool) -> None:
-        self.stale = True
-        """Whether the database may hold something else than the last transaction left."""
         self._read_only = read_only
         self._writer: Any = None
         if url:
@@ -114,13 +112,8 @@ class Database:
             self._engine = sa.create_engine(address, connect_args={"connect_timeout": 10})
             sa.event.listen(self._engine, "connect", self._prepare_postgresql)
         else:
-            require(
-                file.is_file() or not read_only,
-                "folder",
-                expected=f"the folder of a store, with {file.name}",
-                got=str(file.parent),
-                remedy="check the name",
-            )
+            what = f"the folder of a store, with {file.name}"
+            existing("folder", file.parent, file.is_file() or not read_only, what)
             self.name = str(file)
             self._engine = sa.create_engine(sa.URL.create("sqlite", database=str(file)))
             sa.event.listen(self._engine, "connect", self._prepare_sqlite)
@@ -149,23 +142,26 @@ class Database:
             self._writer = None
         self._engine.dispose()
 
-    def reader(self) -> sa.Connection:
-        """A connection for one or a few statements that read; a context manager that closes it."""
-        return self._engine.connect()
+    @contextmanager
+    def reader(self) -> Iterator[Any]:
+        """A connection for one or a few statements that read."""
+        with self._reporting(), self._engine.connect() as connection:
+            yield connection
 
     @contextmanager
     def writer(self) -> Iterator[Any]:
         """The one connection that writes, in a transaction that ends with the block."""
-        if self._writer is None:
-            self._writer = self._engine.connect()
-            self._hold()
-        try:
-            with self._writer.begin():
-                yield self._writer
-        except sa.exc.DBAPIError as error:
-            if error.connection_invalidated:
-                self._drop()
-            raise
+        with self._reporting():
+            if self._writer is None:
+                self._writer = self._engine.connect()
+                self._hold()
+            try:
+                with self._writer.begin():
+                    yield self._writer
+            except sa.exc.DBAPIError as error:
+                if error.connection_invalidated:
+                    self._drop()
+                raise
 
     def insert(self, connection: Any, table: sa.Table, rows: list[tuple]) -> None:
         """Insert rows, whose values are in the order of the table's columns.
@@ -178,7 +174,7 @@ class Database:
             connection.exec_driver_sql(f"INSERT INTO {table.name} VALUES ({marks})", rows)
 
     @contextmanager
-    def reporting(self) -> Iterator[None]:
+    def _reporting(self) -> Iterator[None]:
         """Turn errors of the database into an InputError on one line."""
         try:
             yield
@@ -194,7 +190,7 @@ class Database:
 
     def shrink(self) -> None:
         """Give the pages of removed rows back: to the disk in SQLite, to new rows in PostgreSQL."""
-        with self._engine.connect() as connection:
+        with self.reader() as connection:
             if self._sqlite:
                 # A script, since a statement is executed up to its first row only: one page.
                 raw: Any = connection.connection.driver_connection
@@ -282,7 +278,7 @@ def present(connection: Any, key: int, times: NDArray) -> NDArray:
 def last_entry(connection: Any) -> Entry | None:
     """The newest entry of the log; None if it has none."""
     row = connection.execute(log.select().order_by(log.c.sequence.desc()).limit(1)).one_or_none()
-    return row and Entry(row.sequence, row.kind, row.text, row.previous, row.hash)
+    return row and Entry(*row)
 
 
 def _address(url: str) -> Any:

@@ -1,27 +1,154 @@
-"""`Samples` and whole trajectories of a machine, and the JSON in which they are sent."""
+"""What the store takes: machines, their samples and states; and the JSON of samples."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import at_most, require
+from retwin.checks import at_most, given, require, whole
 from retwin.data.logs.signals import nanoseconds
-from retwin.errors import InputError, brief
-from retwin.monitor.store.updates import EARLIEST, LATEST
+from retwin.errors import InputError
+from retwin.monitor.store.audit import Entry
+from retwin.serialisation.files import refusing
 
+T = TypeVar("T")
+
+EARLIEST, LATEST = -(2**63), 2**63 - 1
+"""The earliest and the latest stream time, in nanoseconds."""
 SECOND = 10**9
 """Nanoseconds of a second."""
 LONGEST = 100_000
 """Samples of a document at most."""
 KEYS = {"asset", "time", "time_ns", "values"}
 REMEDY = 'send {"asset": "line1", "time": 1700000000.0, "values": {"T1": 21.3}}'
+WORD = np.dtype("<f8")
+"""How a value is stored."""
+
+
+@dataclass(frozen=True)
+class Asset:
+    """A machine that is watched.
+
+    Attributes
+    ----------
+    name : str
+        Its unique name.
+    channels : int
+        Values per sample.
+    settings : dict
+        Settings of its monitor, as JSON values.
+    version : int, optional
+        The version of the twin that watches it.
+
+    """
+
+    name: str
+    channels: int
+    settings: dict[str, Any] = field(default_factory=dict)
+    version: int | None = None
+
+
+@dataclass(frozen=True)
+class Update:
+    """What one asset adds in a commit.
+
+    Parameters
+    ----------
+    asset : str
+        Its name.
+    times : array (n,)
+        Stream times of new samples in nanoseconds, in any order.
+    values : array (n, channels)
+        Their values; NaN where missing.
+    state : mapping of str to array, optional
+        The state of its monitor after these samples, which replaces the former one.
+    time : int, optional
+        The stream time of the state in nanoseconds; by default the latest of `times`.
+
+    """
+
+    asset: str
+    times: ArrayLike = ()
+    values: ArrayLike = ()
+    state: Mapping[str, NDArray] | None = None
+    time: int | None = None
+
+
+@dataclass(frozen=True)
+class Committed:
+    """What a commit acknowledged.
+
+    Attributes
+    ----------
+    repeated : dict of str to array (m,)
+        Per asset, times of samples that were stored already or repeated within the commit. Their
+        new values are not stored.
+    entries : list of Entry
+        The new entries of the log.
+
+    """
+
+    repeated: dict[str, NDArray]
+    entries: list[Entry]
+
+
+@dataclass(frozen=True)
+class Packed:
+    """An update as rows of the tables: the times of its samples, their rows, and the state's."""
+
+    asset: str
+    key: int
+    times: NDArray
+    rows: list[tuple]
+    state: tuple | None
+
+
+def pack(update: Update, known: Mapping[str, tuple[int, int]]) -> Packed:
+    """An update as rows, with the keys and the channels of the store's assets by their names.
+
+    Raises
+    ------
+    InputError
+        The asset is unknown, an array has another shape or type, or the state has no time.
+
+    """
+    from safetensors.numpy import save
+
+    key, channels = one_asset(known, update.asset)
+    where = f"update of {update.asset}"
+    expected = f"whole times (n,) and values (n, {channels}), and a state of numeric arrays"
+    remedy = "give times in nanoseconds, one row of values for each, and arrays by their names"
+    with refusing(where, expected=expected, remedy=remedy):
+        times, values = np.asarray(update.times), np.asarray(update.values, dtype=WORD)
+        if times.size == 0:
+            times, values = np.empty(0, np.int64), values.reshape(0, channels)
+        got, shapes = f"{times.dtype} {times.shape} and {values.shape}", (times.shape, values.shape)
+        right = times.dtype.kind == "i" and shapes == ((len(times),), (len(times), channels))
+        require(right, where, expected=expected, got=got, remedy=remedy)
+        # C order, since the writer takes the memory of an array as it lies.
+        arrays = {name: np.asarray(each, order="C") for name, each in (update.state or {}).items()}
+        blob = save(arrays)
+    stamps = times.astype(np.int64)
+    data, size = values.tobytes(), channels * WORD.itemsize
+    rows = [(key, time, data[i * size : (i + 1) * size]) for i, time in enumerate(stamps.tolist())]
+    if update.state is None:
+        return Packed(update.asset, key, stamps, rows, None)
+    time = update.time if update.time is not None else max(stamps.tolist(), default=None)
+    whole(f"time of the state of {update.asset}", time, at_least=EARLIEST, at_most=LATEST)
+    return Packed(update.asset, key, stamps, rows, (key, time, blob))
+
+
+def one_asset(known: Mapping[str, T], name: str) -> T:
+    """What is known of an asset by its name; InputError if it is unknown."""
+    expected = f"one of the store's assets ({', '.join(list(known)[:5]) or 'none'})"
+    remedy = "add it first, with add_asset"
+    return given("asset", known.get(name), expected, got=repr(name)[:80], remedy=remedy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +251,7 @@ def parse(
         No such document, more than 100 000 samples, or an unknown machine or channel.
 
     """
-    times: dict[str, list[int]] = {}
-    rows: dict[str, list[list[float]]] = {}
+    rows: dict[str, list[tuple[int, list[float]]]] = {}
     known: dict[str, dict[str, int]] = {}
     trajectories: list[Samples | Trajectory] = []
     count = 0
@@ -133,8 +259,8 @@ def parse(
     for number, each in enumerate(_objects(document)):
         place = f"sample {number}"
         given = each.get("values") if isinstance(each, dict) else None
-        given = given if isinstance(given, dict) else {}
-        length = max(map(_length, given.values()), default=0)
+        columns = given.values() if isinstance(given, dict) else ()
+        length = max((len(column) for column in columns if isinstance(column, list)), default=0)
         count += max(1, length)
         at_most("samples", count, LONGEST, "in a document", remedy="send them in parts")
         require(
@@ -149,22 +275,22 @@ def parse(
             raise _refused(f"{place}: asset", name, "its name" if asset is None else repr(asset))
         if name not in known:
             known[name] = {channel: i for i, channel in enumerate(channels(name))}
+        time, block = _time(each, place), _block(given, length, known[name], place)
         if length:
-            columns = _columns(given, length, place)
-            block = [_row(row, known[name], place) for row in columns]
-            trajectories.append(Trajectory(name, _time(each, place), np.array(block)))
-            continue
-        times.setdefault(name, []).append(_time(each, place))
-        rows.setdefault(name, []).append(_row(each["values"], known[name], place))
-    return [
-        *(Samples(name, np.array(times[name], np.int64), np.array(rows[name])) for name in times),
-        *trajectories,
-    ]
+            trajectories.append(Trajectory(name, time, np.array(block)))
+        else:
+            rows.setdefault(name, []).append((time, block[0]))
+    samples = []
+    for name, own in rows.items():
+        times, values = zip(*own, strict=True)
+        samples.append(Samples(name, np.array(times, np.int64), np.array(values)))
+    return [*samples, *trajectories]
 
 
 def _objects(document: bytes | str) -> Iterator[Any]:
     """The objects of a document: one, those of an array, or one of each line."""
-    try:
+    expected = "a JSON object, an array of them, or one on each line"
+    with refusing("samples", expected=expected, remedy=REMEDY):
         text = document if isinstance(document, str) else document.decode("utf-8")
         lines = [each for each in text.split("\n") if each.strip()]
         try:
@@ -172,17 +298,9 @@ def _objects(document: bytes | str) -> Iterator[Any]:
         except json.JSONDecodeError:
             if len(lines) < 2:
                 raise
-            for each in lines:
-                yield json.loads(each)
+            yield from map(json.loads, lines)
         else:
             yield from whole if isinstance(whole, list) else [whole]
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            "samples",
-            expected="a JSON object, an array of them, or one on each line",
-            got=f"{type(error).__name__}: {brief(error)}",
-            remedy=REMEDY,
-        ) from None
 
 
 def _refused(place: str, given: object, expected: str, remedy: str = REMEDY) -> InputError:
@@ -211,41 +329,33 @@ def _time(each: dict[str, Any], place: str) -> int:
     raise _refused(f"{place}: time", given, expected)
 
 
-def _length(value: Any) -> int:
-    """Of an array; 0 for a number."""
-    return len(value) if isinstance(value, list) else 0
+def _block(values: Any, length: int, places: dict[str, int], place: str) -> list[list[float]]:
+    """The values (T, channels) of a trajectory, or of one sample if its length is 0.
 
-
-def _columns(values: dict[str, Any], length: int, place: str) -> Iterator[dict[str, Any]]:
-    """The values of each sample of a trajectory, whose channels are arrays of one length."""
-    for name, value in values.items():
-        if _length(value) != length:
-            raise InputError(
-                f"{place}: {repr(name)[:60]}",
-                expected=f"an array of {length} numbers, as another channel has",
-                got=f"{_length(value)}" if isinstance(value, list) else repr(value)[:60],
-                remedy="send one value per sample of each channel, null where it is missing",
-            )
-    return (dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True))
-
-
-def _row(values: Any, places: dict[str, int], place: str) -> list[float]:
-    """The values of all channels; NaN where one is missing."""
-    made = [np.nan] * len(places)
+    NaN where one is missing.
+    """
     if not isinstance(values, dict):
         raise _refused(f"{place}: values", values, "an object of channels")
+    made = [[np.nan] * len(places) for _ in range(max(1, length))]
     for name, value in values.items():
         if name not in places:
             expected = f"channels among {', '.join(places)}"
             remedy = "leave it out, or correct its name"
             raise _refused(f"{place}: values", name, expected, remedy)
-        if value is None:
-            continue
-        try:
-            if not isinstance(value, int | float):
-                raise TypeError
-            made[places[name]] = float(value)
-        except (TypeError, OverflowError):
-            remedy = "send numbers as JSON numbers"
-            raise _refused(f"{place}: {name}", value, "a number or null", remedy) from None
+        column, several = value if length else [value], isinstance(value, list)
+        if length and not (several and len(value) == length):
+            raise InputError(
+                f"{place}: {repr(name)[:60]}",
+                expected=f"an array of {length} numbers, as another channel has",
+                got=str(len(value)) if several else repr(value)[:60],
+                remedy="send one value per sample of each channel, null where it is missing",
+            )
+        for row, each in zip(made, column, strict=True):
+            try:
+                if not isinstance(each, int | float | None):
+                    raise TypeError
+                row[places[name]] = np.nan if each is None else float(each)
+            except (TypeError, OverflowError):
+                remedy = "send numbers as JSON numbers"
+                raise _refused(f"{place}: {name}", each, "a number or null", remedy) from None
     return made

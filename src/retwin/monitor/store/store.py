@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import instance, require, whole
+from retwin.checks import instance, one_per, require, whole
 from retwin.monitor.store import database
 from retwin.monitor.store.audit import START, Entry, append, canonical
 from retwin.monitor.store.database import (
@@ -28,7 +28,7 @@ from retwin.monitor.store.database import (
     samples,
     states,
 )
-from retwin.monitor.store.updates import (
+from retwin.monitor.store.samples import (
     EARLIEST,
     LATEST,
     WORD,
@@ -97,6 +97,8 @@ class Store:
         self._max_samples = max_samples
         self.lock = threading.RLock()
         """Held while a thread reads something and writes what depends on it."""
+        self._stale = True
+        """Whether the database may hold something else than the last transaction left."""
         self._last: Entry | None = None
         self._assets: dict[str, tuple[int, int]] | None = None
         """Key and channels of each asset by its name; None if they must be read."""
@@ -106,10 +108,9 @@ class Store:
                 opened.enter_context(in_use(self.folder))
             self._database = Database(self.folder / FILE, url, read_only=read_only)
             opened.callback(self._database.close)
-            with self._database.reporting():
-                self._database.open()
-                if not read_only:
-                    self._shrink()
+            self._database.open()
+            if not read_only:
+                self._shrink()
             self._opened = opened.pop_all()
 
     def __enter__(self) -> Store:
@@ -165,7 +166,7 @@ class Store:
 
     def assets(self) -> list[Asset]:
         """All assets in the order in which they were added."""
-        with self._reading() as connection:
+        with self._database.reader() as connection:
             rows = connection.execute(assets.select().order_by(assets.c.id)).all()
         loaded = [(row, Entry(0, "", row.settings, "", "").data) for row in rows]
         return [Asset(row.name, row.channels, data, row.version) for row, data in loaded]
@@ -193,13 +194,7 @@ class Store:
             known = self._known(connection)
             packed = [pack(each, known) for each in updates]
             names = [each.asset for each in packed]
-            require(
-                len(set(names)) == len(names),
-                "updates",
-                expected="one per asset",
-                got="several of one",
-                remedy="join the samples of an asset",
-            )
+            one_per("updates", names, len(set(names)), "asset", remedy="join the samples of each")
             repeated = {}
             rows = []
             for each in packed:
@@ -254,7 +249,7 @@ class Store:
         from safetensors.numpy import load
 
         key, _ = self._asset(asset)
-        with self._reading() as connection:
+        with self._database.reader() as connection:
             row = connection.execute(states.select().where(states.c.asset == key)).one_or_none()
         if row is None:
             return None
@@ -266,7 +261,7 @@ class Store:
         if not len(times):
             return np.zeros(0, dtype=np.int64)
         key, _ = self._asset(asset)
-        with self._reading() as connection:
+        with self._database.reader() as connection:
             return present(connection, key, times)
 
     def log(self, kind: str | None = None, after: int = -1) -> Iterator[Entry]:
@@ -276,8 +271,7 @@ class Store:
         """
         chosen = log.select() if kind is None else log.select().where(log.c.kind == kind)
         for rows in self._parts(chosen, log.c.sequence, after):
-            for row in rows:
-                yield Entry(row.sequence, row.kind, row.text, row.previous, row.hash)
+            yield from (Entry(*row) for row in rows)
 
     def _parts(
         self, chosen: sa.Select, key: sa.Column, last: int | None
@@ -288,7 +282,7 @@ class Store:
         """
         while True:
             later = chosen if last is None else chosen.where(key > last)
-            with self._reading() as connection:
+            with self._database.reader() as connection:
                 rows = connection.execute(later.order_by(key).limit(ROWS)).all()
             if not rows:
                 return
@@ -296,14 +290,18 @@ class Store:
             last = int(rows[-1]._mapping[key])
 
     @property
+    def last(self) -> Entry | None:
+        """The last entry of the log; None if it has none."""
+        with self._database.reader() as connection:
+            return last_entry(connection)
+
+    @property
     def head(self) -> str:
         """The hash of the last entry of the log: keep it elsewhere to detect a cut-off log."""
-        with self._reading() as connection:
-            last = last_entry(connection)
-        return START if last is None else last.hash
+        return last.hash if (last := self.last) else START
 
     def _asset(self, name: str) -> tuple[int, int]:
-        with self.lock, self._reading() as connection:
+        with self.lock, self._database.reader() as connection:
             return one_asset(self._known(connection), name)
 
     def _known(self, connection: Any) -> dict[str, tuple[int, int]]:
@@ -311,11 +309,6 @@ class Store:
             rows = connection.execute(assets.select()).all()
             self._assets = {row.name: (row.id, row.channels) for row in rows}
         return self._assets
-
-    @contextmanager
-    def _reading(self) -> Iterator[Any]:
-        with self._database.reporting(), self._database.reader() as connection:
-            yield connection
 
     @contextmanager
     def _writing(self) -> Iterator[Any]:
@@ -327,17 +320,17 @@ class Store:
             got="one that was opened to read only",
             remedy="open it without read_only",
         )
-        with self.lock, self._database.reporting():
+        with self.lock:
             try:
                 with self._database.writer() as connection:
-                    if self._database.stale:
+                    if self._stale:
                         self._last = last_entry(connection)
                         self._assets = None
                         self._held = {}
-                        self._database.stale = False
+                        self._stale = False
                     yield connection
             except BaseException:
-                self._database.stale = True
+                self._stale = True
                 raise
 
     def _new(self, connection: Any, packed: Packed) -> NDArray:

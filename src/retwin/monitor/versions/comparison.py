@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import threading
+import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import agree, given, require
+from retwin.checks import agree, at_least, at_most, given, require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.inversion.trajectories import InversionDiagnoser
 from retwin.evaluation.fidelity.simulation import simulate_records
@@ -37,6 +41,11 @@ TRAJECTORIES_BEFORE = 10
 """Trajectories before an alarm that are left out: its cause may already act in them."""
 DRAWS = 200
 """Simulations of each trajectory; the CRPS has no bias by their number."""
+FRESH, PATIENCE, QUEUE = 60.0, 20.0, 16
+"""A comparison is kept for so many seconds, or for so many times as long as it took, whichever is
+longer; and comparisons that may be made or kept."""
+LATER = "compare the versions later"
+"""What to do where too little is stored."""
 KINDS: Mapping[type, str] = {Monitor: "samples", TrajectoryMonitor: "trajectories"}
 
 
@@ -108,18 +117,11 @@ def _of_samples(store: Store, twin: str, watching: Sequence[Any]) -> Scored:
         if seen[0].events:  # an alarm that was not raised when the samples came, after another one
             continue
         known = np.where(np.isfinite(seen[0].score) & np.isfinite(seen[1].score), measured, np.nan)
-        unit = np.nanstd(measured, axis=1, keepdims=True)
-        unit = np.where(unit > 0, unit, 1.0)
         found = [crps_normal(known, each.mean, each.deviation) for each in seen[:2]]
-        scores.append([_mean((each / unit)[0]) for each in found])
+        scores.append([_mean(each[0] / _deviation(measured[0])) for each in found])
         alarms += [len(each.events) for each in seen]
-    require(
-        scores,
-        "samples",
-        expected=f"at least {2 * MIN_SAMPLES} without an alarm, of one asset",
-        got="fewer",
-        remedy="compare the versions later",
-    )
+    expected = f"at least {2 * MIN_SAMPLES} without an alarm, of one asset"
+    require(scores, "samples", expected=expected, got="fewer", remedy=LATER)
     samples = max(sum(int(np.isfinite(each[1]).sum()) for each in scores), 1)
     counted = list(zip(alarms.tolist(), watching, strict=True))[1:]
     return scores, [FalseAlarmTest(count, samples, each.arl) for count, each in counted]
@@ -138,15 +140,10 @@ def _of_trajectories(store: Store, twin: str, watching: Sequence[Any]) -> Scored
         for part in _healthy_trajectories(store, twin, old)
     ]
     every = [each for part in machines for each in part]
-    require(
-        len(every) >= MIN_TRAJECTORIES,
-        "trajectories",
-        expected=f"at least {MIN_TRAJECTORIES} healthy ones that are stored, of all machines "
-        "together",
-        got=len(every),
-        remedy="compare the versions later",
-    )
-    unit = _deviation(every)
+    what = "healthy ones that are stored, of all machines together"
+    at_least("trajectories", every, MIN_TRAJECTORIES, what, remedy=LATER)
+    outputs = [np.where(each.mask, each.observed, np.nan)[0] for each in every]
+    unit = _deviation(np.concatenate(outputs).astype(float))
     twins = [_predicting(each) for each in watching[:2]]
     length = len(every) // BLOCKS
     scores: list[NDArray] = []
@@ -189,10 +186,8 @@ def _healthy_samples(store: Store, twin: str, monitor: Monitor) -> Iterator[NDAr
         times, rows = gridded(store, name, monitor.twin, first, newest)
         ends = np.searchsorted(times, sorted(alarms.get(name, [])))
         ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))
-        first = int(np.argmax(np.diff(ends))) if len(ends) > 1 else 0
-        part = rows[ends[first] : ends[first + 1] - BEFORE]
-        known = np.isfinite(part[:, : len(monitor.twin.inputs)]).all(axis=1)
-        yield part[int(np.argmax(known)) :] if known.any() else part[:0]
+        first = int(np.argmax(np.diff(ends)))
+        yield rows[ends[first] : ends[first + 1] - BEFORE]
 
 
 def _tested(monitor: TrajectoryMonitor, machines: list[list[Trajectories]]) -> FalseAlarmTest:
@@ -238,12 +233,11 @@ def _predicting(monitor: TrajectoryMonitor) -> Twin:
     return own.twin
 
 
-def _deviation(records: list[Trajectories]) -> NDArray:
-    """The standard deviation (d_y,) of what was measured of each output; 1 for a constant one."""
-    measured = np.concatenate([np.where(each.mask, each.observed, np.nan)[0] for each in records])
+def _deviation(measured: NDArray) -> NDArray:
+    """The standard deviation (d_y,) of each output (T, d_y); 1 for one that is constant."""
     seen = np.isfinite(measured).any(axis=0)
     found = np.ones(measured.shape[1])
-    found[seen] = np.nanstd(measured[:, seen].astype(float), axis=0)
+    found[seen] = np.nanstd(measured[:, seen], axis=0)
     return np.where(found > 0, found, 1.0)
 
 
@@ -253,3 +247,47 @@ def _crps(twin: Twin, record: Trajectories, unit: NDArray) -> float:
         warnings.simplefilter("ignore")
         found = simulate_records(twin, record, draws=DRAWS, seed=0).crps[0] / unit
     return float(found[record.mask[0]].mean())
+
+
+@dataclass(eq=False)
+class _Made:
+    """A comparison, and until when it is kept once it is done."""
+
+    future: Future[Decision]
+    begun: float = field(default_factory=time.monotonic)
+    until: float = float("inf")
+
+    def done(self, _: object) -> None:
+        """Note that it is done."""
+        now = time.monotonic()
+        self.until = now + max(FRESH, PATIENCE * (now - self.begun))
+
+
+class Comparisons:
+    """Comparisons in a thread of their own, one after the other, each kept for a while.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._worker = ThreadPoolExecutor(1, "comparison")
+        self._made: dict[tuple[str, int], _Made] = {}
+        self._lock = threading.Lock()
+
+    def of(self, twin: str, number: int) -> Future[Decision]:
+        """The comparison of a version with the active one."""
+        key, now = (twin, number), time.monotonic()
+        with self._lock:
+            self._made = {each: made for each, made in self._made.items() if now < made.until}
+            if key not in self._made:
+                count = len(self._made) + 1
+                at_most("comparison", count, QUEUE, "at a time", remedy="wait for a minute")
+                made = _Made(self._worker.submit(compare, self._store, twin, number))
+                self._made[key] = made
+                made.future.add_done_callback(made.done)
+            return self._made[key].future

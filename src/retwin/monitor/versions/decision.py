@@ -146,12 +146,10 @@ def decide(
     difference = (old - new)[:, :, None]
     draws = bootstrap_means(difference, draws=DRAWS, seed=seed)
     mean = float(np.nanmean(difference, axis=1).mean())
-    if len(old) >= MIN_RECORDS:  # the draws are already as wide as Student's interval
-        width = 1.96 * float(np.nanstd(draws))
-    else:
-        blocks = BLOCKS * len(old)
-        scale = np.sqrt(BLOCKS / (BLOCKS - 1)) * stdtrit(blocks - len(old), 0.975)
-        width = float(scale * np.nanstd(draws))
+    scale = 1.96  # of many records: the draws are already as wide as Student's interval
+    if len(old) < MIN_RECORDS:
+        scale = np.sqrt(BLOCKS / (BLOCKS - 1)) * stdtrit((BLOCKS - 1) * len(old), 0.975)
+    width = float(scale * np.nanstd(draws))
     return Decision(
         float(np.nanmean(old, axis=1).mean()),
         float(np.nanmean(new, axis=1).mean()),

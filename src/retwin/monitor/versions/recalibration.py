@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from retwin.checks import finite, given, instance, require
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.detect.events import CHANGED
-from retwin.monitor.live.sentences import sentence
+from retwin.monitor.live.notifications import sentence
 from retwin.monitor.models.cause import BEFORE
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.kinds import load_monitor

@@ -197,16 +197,13 @@ class Registry:
         """Make the version active that was so before the active one, which is retired."""
         with self._store.lock:
             history = self._read()[1]
-            require(
-                len(history) > 1,
-                "rollback",
-                expected="a version that was active before",
-                got=f"{len(history)} that was active" if history else "none that was ever active",
-                remedy="propose and promote another version",
-            )
-            self.folder(history[-2])
-            self._log("rollback", history[-2], reason=reason)
-            return self._read()[0][history[-2]]
+            expected, got = "a version that was active before", f"{len(history)} that was active"
+            former = history[-2] if len(history) > 1 else None
+            remedy = "propose and promote another version"
+            number = given("rollback", former, expected, got=got, remedy=remedy)
+            self.folder(number)
+            self._log("rollback", number, reason=reason)
+            return self._version(number)
 
     def folder(self, number: int) -> Path:
         """The folder of a version, after its bytes were compared with its hash; only read it.

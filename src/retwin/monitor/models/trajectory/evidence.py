@@ -108,12 +108,15 @@ def compared(
     measured = trajectories.mask.sum(axis=1)
     evidence = np.zeros((len(trajectories), len(alternatives(diagnoser)) + 1))
     outside = np.zeros(len(trajectories), dtype=bool)
-    offset = np.full((len(trajectories), 0, len(trajectories.inputs)), np.nan)
-    some = np.flatnonzero(measured.any(axis=1))
-    if len(some):
-        evidence[some], outside[some], found = _diagnosed(diagnoser, trajectories[some], progress)
-        offset = np.full((len(trajectories), *found.shape[1:]), np.nan)
-        offset[some] = found
+    some = np.flatnonzero(measured.any(axis=1)).tolist()
+    # One by one: the last digits of a batch depend on what else is in it, and a monitor that is
+    # continued later has to find the same bytes.
+    found = [_diagnose(diagnoser, trajectories[[i]]) for i in tracked(some, len(some), progress)]
+    most = max((each.shape[1] for _, _, each in found), default=0)  # each has its own segments
+    offset = np.full((len(trajectories), most, len(trajectories.inputs)), np.nan)
+    for i, (explained, beyond, offsets) in zip(some, found, strict=True):
+        evidence[i], outside[i] = explained[0], beyond[0]
+        offset[i, : offsets.shape[1]] = offsets[0]
     healthy = list(diagnoser.faults.values()).index(None)
     own = evidence[:, healthy]
     implausible: NDArray = ~np.isfinite(own)
@@ -134,26 +137,8 @@ def factors(ratio: NDArray, kappa: float) -> NDArray:
     return np.exp(logs)
 
 
-def _diagnosed(
-    diagnoser: Inversion, trajectories: Trajectories, progress: Progress | None
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Evidence (n, F + 1) of classes, NaN where implausible; `outside`; and offsets.
-
-    Trajectories are diagnosed one by one: the last digits of a batch depend on what else is in it,
-    and a monitor that is continued later has to find the same bytes.
-    """
-    each_of = tracked(range(len(trajectories)), len(trajectories), progress)
-    found = [_one(diagnoser, trajectories[[i]]) for i in each_of]
-    evidence, outside = (np.concatenate([each[k] for each in found]) for k in range(2))
-    most = max(each[2].shape[1] for each in found)  # alone, each has the segments that it has
-    offset = np.full((len(found), most, len(trajectories.inputs)), np.nan)
-    for row, each in zip(offset, found, strict=True):
-        row[: each[2].shape[1]] = each[2][0]
-    return evidence, outside, offset
-
-
-def _one(diagnoser: Inversion, trajectory: Trajectories) -> tuple[NDArray, NDArray, NDArray]:
-    """Those of one trajectory."""
+def _diagnose(diagnoser: Inversion, trajectory: Trajectories) -> tuple[NDArray, NDArray, NDArray]:
+    """Evidence (1, F + 1) of classes for a trajectory, NaN if implausible; `outside`; offsets."""
     if isinstance(diagnoser, InversionDiagnoser):
         found = diagnoser.diagnose(trajectory)
         return found.evidence, found.outside, found.offset

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from retwin.checks import finite, instance, require
+from retwin.checks import finite, instance, nothing, require
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.monitor.detect.offsets import biases, fit_offsets
@@ -72,7 +72,10 @@ def fit_trajectory_monitor(
     diagnoser = checked(checked(diagnoser).with_faults(causes or {}))
     instance("healthy", healthy, Trajectories, remedy="load recorded ones")
     finite("alpha", alpha, at_least=1e-12, at_most=0.5)
-    _check_labels(diagnoser, healthy)
+    allowed = {HEALTHY, *(name for name, fault in diagnoser.faults.items() if fault is None)}
+    faulty = [f"some labelled {name}" for name in sorted(healthy.known_labels - allowed)[:3]]
+    expected = f"trajectories without labels, or labelled {' or '.join(sorted(allowed))}"
+    nothing("healthy", faulty, expected, remedy="leave these out")
     length = healthy.steps / healthy.rate
     arl = false_alarms(false_alarms_at_most, 1 / length)
     found = compared(diagnoser, healthy, progress)
@@ -95,36 +98,14 @@ def fit_trajectory_monitor(
         factor = factors(ratio, kappa).mean(axis=1)
         bound = factor.mean() + CERTAIN * factor.std(ddof=1) / np.sqrt(len(factor))
         if bound <= 1:
-            return TrajectoryMonitor(
-                diagnoser,
-                scores,
-                slack,
-                float(kappa),
-                arl,
-                length,
-                np.stack([count.min(axis=0), count.max(axis=0)]).astype(float),
-                offsets,
-                float(alpha),
-                int(used.sum()),
-                len(healthy),
-            )
+            measured = np.stack([count.min(axis=0), count.max(axis=0)]).astype(float)
+            about = float(kappa), arl, length, measured, offsets, float(alpha)
+            counts = int(used.sum()), len(healthy)
+            return TrajectoryMonitor(diagnoser, scores, slack, *about, *counts)
     likely = alternatives(diagnoser)[int(np.median(ratio, axis=0).argmax())]
     raise InputError(
         "healthy",
         expected="trajectories that the diagnoser takes for healthy ones",
         got=f"some that look like {likely}",
         remedy="leave out faulty ones, or calibrate the twin on more healthy trajectories",
-    )
-
-
-def _check_labels(diagnoser: Inversion, healthy: Trajectories) -> None:
-    """Refuse trajectories that are labelled as faulty ones."""
-    allowed = {HEALTHY, *(name for name, fault in diagnoser.faults.items() if fault is None)}
-    faulty = sorted(healthy.known_labels - allowed)
-    require(
-        not faulty,
-        "healthy",
-        expected=f"trajectories without labels, or labelled {' or '.join(sorted(allowed))}",
-        got=f"some labelled {', '.join(faulty[:3])}",
-        remedy="leave these out",
     )

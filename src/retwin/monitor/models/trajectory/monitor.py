@@ -36,8 +36,11 @@ from retwin.monitor.models.trajectory.evidence import (
     factors,
     twin_of,
 )
-from retwin.monitor.models.trajectory.state import TrajectoryState
-from retwin.monitor.models.trajectory.watched import TrajectoryAlarm, WatchedTrajectories
+from retwin.monitor.models.trajectory.state import (
+    TrajectoryAlarm,
+    TrajectoryState,
+    WatchedTrajectories,
+)
 from retwin.progress import Progress
 from retwin.serialisation.models import check_weights, read_model, refusing, write_model
 
@@ -197,16 +200,8 @@ class TrajectoryMonitor:
                 about = str(trajectories.ids[t]), state.count - 1, name, float(evidence[t])
                 shown = {each: share for each, share in shares.items() if share >= SHOWN}
                 alarms.append(TrajectoryAlarm(*about, probability, shown, bool(found.outside[t])))
-        return state, WatchedTrajectories(
-            middle(low, high)[0],
-            evidence,
-            void,
-            found.outside,
-            found.unmeasured,
-            unranked,
-            found.implausible,
-            alarms,
-        )
+        flags = void, found.outside, found.unmeasured, unranked, found.implausible
+        return state, WatchedTrajectories(middle(low, high)[0], evidence, *flags, alarms)
 
     def _unranked(self, found: Compared) -> NDArray:
         """Whether trajectories (n,) were measured otherwise than those of the calibration."""
