@@ -16,10 +16,10 @@ from torch import Tensor
 from retwin.nets.mixtures import BernoulliHead
 from retwin.nets.student import widening
 from retwin.nets.training import Fit, Training, train
-from retwin.progress import Progress, part_of
+from retwin.progress import part_of
 from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.penalties import BOUND_MARGIN, SMALLEST, checked_bounds, penalties
-from retwin.update.residual.targets import Targets
+from retwin.update.residual.targets import ResidualTask, Targets
 
 HELD_OUT = 20
 """Trajectories to hold out at least, over all folds: a standard deviation from twenty values has a
@@ -35,14 +35,7 @@ PERSISTENCES = np.linspace(0.0, 0.95, 96)
 """Values of the persistence that are equally probable before the data."""
 
 
-def fit_segments(
-    model: ResidualModel,
-    targets: Targets,
-    *,
-    bounds: NDArray | None,
-    seed: int,
-    progress: Progress | None,
-) -> tuple[Fit, Tensor]:
+def fit_segments(model: ResidualModel, targets: Targets, task: ResidualTask) -> tuple[Fit, Tensor]:
     """Train `model` in place, and calibrate it on trajectories that it was not trained on.
 
     A fifth of the trajectories, or one, is held out for early stopping. Where that is too few to
@@ -57,12 +50,8 @@ def fit_segments(
         With its initial weights.
     targets : Targets
         z of all trajectories.
-    bounds : NDArray, optional
-        (d_z,), b of Eq. 9; by default 1.25 times the largest |z*|.
-    seed : int
-        Seed of folds, order of examples and dropout.
-    progress : callable, optional
-        Called with the share of the training that is done.
+    task : ResidualTask
+        Bounds, and the seed of folds, order of examples and dropout.
 
     Returns
     -------
@@ -76,15 +65,15 @@ def fit_segments(
     targets = targets[rows]
     # Of a single trajectory two halves are held out in turn, as if they were two.
     parts = targets if len(rows) > 1 else targets.halved()
-    folds = _folds(len(parts.valid), seed)
+    folds = _folds(len(parts.valid), task.seed)
     runs = len(folds) + (len(folds) > 1)
     members = [copy.deepcopy(model) for _ in folds] if len(folds) > 1 else [model]
     fits = []
     for k, (member, held_out) in enumerate(zip(members, folds, strict=True)):
         every = torch.arange(len(parts.valid))
         rest = every[~torch.isin(every, held_out)]
-        sets = parts[rest], parts[held_out]
-        fits.append(_trained(member, *sets, bounds, seed, part_of(progress, k, runs)))
+        own = part_of(task.progress, k, runs)
+        fits.append(_trained(member, parts[rest], parts[held_out], replace(task, progress=own)))
     with torch.no_grad():
         unseen = [(each, parts[fold]) for each, fold in zip(members, folds, strict=True)]
         spread = _spread(unseen)
@@ -92,8 +81,8 @@ def fit_segments(
     if len(folds) > 1:
         epochs = round(float(np.mean([fit.best_epoch for fit in fits])))
         how = replace(model.density.training, max_epochs=epochs)
-        last = part_of(progress, len(folds), runs)
-        refit = _trained(model, targets, None, bounds, seed, last, how)
+        last = replace(task, progress=part_of(task.progress, len(folds), runs))
+        refit = _trained(model, targets, None, last, how)
         reason = f"{epochs} epochs, as many as were best on average in {len(folds)} folds"
         fits.append(replace(refit, reason=reason))
     # Events are too few to show whether they persist.
@@ -106,7 +95,7 @@ def fit_segments(
     ratio = needed / _deviation([(model, part) for _, part in unseen])
     model.spread.copy_(torch.where(model.events, 1.0, ratio.clamp_min(1.0)))
     model.degrees = _degrees(model, targets, persistence)
-    if bounds is None:
+    if task.bounds is None:
         # The largest of few |z*| is uncertain as the width is. The spread corrects the network.
         wider = torch.tensor([widening(each) for each in model.degrees])
         model.bounds.mul_(wider.repeat_interleave(torch.tensor(model.sizes)))
@@ -125,22 +114,14 @@ def _trained(
     model: ResidualModel,
     fitted: Targets,
     held_out: Targets | None,
-    bounds: NDArray | None,
-    seed: int,
-    progress: Progress | None,
+    task: ResidualTask,
     how: Training | None = None,
 ) -> Fit:
     """Train `model` in place, with units, bounds and initial heads from its training data."""
-    _prepare(model, fitted, bounds, seed)
-    return train(
-        model,
-        _objective,
-        fitted.examples(model),
-        None if held_out is None else held_out.examples(model),
-        how or model.density.training,
-        seed=seed,
-        progress=progress,
-    )
+    _prepare(model, fitted, task.bounds, task.seed)
+    sets = fitted.examples(model), None if held_out is None else held_out.examples(model)
+    how = how or model.density.training
+    return train(model, _objective, *sets, how, seed=task.seed, progress=task.progress)
 
 
 def _spread(held_out: list[tuple[ResidualModel, Targets]]) -> Tensor:

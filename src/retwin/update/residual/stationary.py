@@ -8,14 +8,14 @@ import torch
 from torch import Tensor, nn
 
 from retwin.checks import require
-from retwin.data.trajectories import Trajectories
 from retwin.nets.mixtures import Blocks, GaussianMixture
 from retwin.nets.training import Fit
-from retwin.update.corrections import Context, Correction, Discrepancy
+from retwin.update.corrections import Context
 from retwin.update.residual.penalties import SMALLEST
 from retwin.update.residual.residual import Residual
 from retwin.update.residual.sequence import autoregressive
 from retwin.update.residual.sequence_fitting import MAX_PERSISTENCE
+from retwin.update.residual.targets import ResidualTask
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,10 @@ class StationaryResidual(Residual[StationaryNoise]):
         return self.spread * self.scale * autoregressive(noise, self.persistence)
 
 
-def fit_stationary(
-    used: Trajectories, correction: Correction, density: StationaryNoise, found: Discrepancy
-) -> StationaryResidual:
+def fit_stationary(task: ResidualTask, density: StationaryNoise) -> StationaryResidual:
     """The noise of measured records, given their discrepancies; it is not random."""
-    model = StationaryResidual(correction, density, inputs=used.inputs, outputs=used.outputs)
+    used, found = task.used, task.found
+    model = StationaryResidual(task.correction, density, inputs=used.inputs, outputs=used.outputs)
     seen, z = found.identified, torch.where(found.identified, found.z, 0.0).double()
     power = z.square().sum(dim=(0, 1)) / seen.sum(dim=(0, 1)).clamp_min(1)
     both = seen[:, 1:] & seen[:, :-1]
@@ -90,8 +89,7 @@ def fit_stationary(
     model.scale.copy_(power.sqrt().clamp_min(SMALLEST))
     model.persistence.copy_(persistence.clamp(0.0, MAX_PERSISTENCE))
     model.bounds.fill_(torch.inf)
-    model.emulated = used.emulated
     pairs = zip(model.latent.names, power.sqrt().tolist(), strict=True)
     figures = {f"rmse_{name}": value for name, value in pairs} | {"samples": float(seen.sum())}
     model.fitted = Fit(figures, {}, 0, "errors of the twin as noise")
-    return model.eval()
+    return model
