@@ -18,7 +18,7 @@ from torch import Tensor
 from retwin.inference.noise import Noise
 from retwin.inference.normal import compiled_objective, compiled_step
 from retwin.inference.priors import GaussianPrior, inverse
-from retwin.inference.problem import Problem
+from retwin.inference.problem import Problem, Rows
 
 TOLERANCE = 1e-4
 """Predicted decrease of the objective, in nats, below which a row has converged."""
@@ -59,7 +59,7 @@ class Bounds:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(Rows):
     """The most probable latent variables of R rows, and the Gaussian approximation there.
 
     Attributes
@@ -90,15 +90,6 @@ class Solution:
         """At x (R, P), without any measured output."""
         energy = prior.energy(x)
         return cls(x, energy, prior.precision, -energy, prior.gradient(x))
-
-    def __getitem__(self, rows: Tensor) -> Solution:
-        """The solution of some rows."""
-        return Solution(*(each[rows] for each in vars(self).values()))
-
-    def put(self, rows: Tensor, other: Solution) -> Solution:
-        """The same with another solution in some rows."""
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return Solution(*(own.index_copy(0, rows, new) for own, new in pairs))
 
     @property
     def covariance(self) -> Tensor:

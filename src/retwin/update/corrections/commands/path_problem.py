@@ -13,7 +13,7 @@ from retwin.data.segments import Segments
 from retwin.inference.losses import Tukey
 from retwin.inference.noise import Noise, common_rounding, correlation_time
 from retwin.inference.solver import Bounds
-from retwin.update.corrections.delays import delay_bounds
+from retwin.update.corrections.delays import DelayProblem, delay_bounds
 from retwin.update.corrections.sampled_sensor import lattice_step
 from retwin.update.corrections.warp import Knots, interpolate, within
 
@@ -27,8 +27,6 @@ MAX_CORRELATION = 0.999
 """Largest lag-one autocorrelation of residuals: slow drift makes nearly all samples one."""
 SINGLE = torch.finfo(torch.float32).eps
 """Relative distance of neighbouring numbers in single precision."""
-COMMON = ("delay_range", "rounding")
-"""Fields of `PathProblem` that all trajectories share."""
 
 
 def path_at(segments: Segments, path: Tensor, z: Tensor) -> Tensor:
@@ -38,7 +36,7 @@ def path_at(segments: Segments, path: Tensor, z: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class PathProblem:
+class PathProblem(DelayProblem):
     """Residual and Jacobian for x = (delay, offsets) of every segment.
 
     The engine's rows are trajectories, its latent variables x (n, P), P = M (1 + d_y). Samples at
@@ -50,37 +48,24 @@ class PathProblem:
     ----------
     common : None
         The surrogate's error, which the path contains, is added to the covariance of z.
-    segments : Segments
-        M at most.
     path : Tensor
-        (n, T, d_y), uncorrected.
-    observed : Tensor
-        (n, T, d_y), in the same unit.
+        (n, T, d_y), uncorrected; `observed` is in the same unit, and every `sample` (T,) is used.
     available : Tensor
-        (n, T, d_y) bool, which outputs were measured.
-    measured : Tensor
-        (n, T), share of a sample's outputs that was measured.
+        (n, T, d_y) bool, which outputs were measured; `measured` (n, T) is the share of a sample's
+        outputs that was.
     factor : Tensor
         (n, T, d_y), what residuals are multiplied by; 0 where nothing was measured.
-    group : Tensor
-        (n, T) long.
-    delay_range : tuple of float
-        Smallest and largest delay, in samples.
     rounding : float
         Standard deviation of the error of a sample by rounding, of all outputs together.
 
     """
 
-    segments: Segments
     path: Tensor
-    observed: Tensor
     available: Tensor
-    measured: Tensor
     factor: Tensor
-    group: Tensor
-    delay_range: tuple[float, float]
-    rounding: float = 0.0
+    rounding: float
     common: ClassVar[None] = None
+    shared = ("sample", "delay_range", "rounding")
 
     @classmethod
     def of(
@@ -106,9 +91,9 @@ class PathProblem:
             )
         ]
         rounding = math.hypot(*steps) / math.sqrt(12)
-        return cls(
-            segments, path, observed, available, measured, factor, group, delay_range, rounding
-        )
+        sample, given = torch.arange(segments.steps, dtype=torch.float64), (path, available)
+        common = segments, sample, measured, group, observed, delay_range
+        return cls(*common, *given, factor, rounding)
 
     def with_motion(self, delay: Tensor) -> PathProblem:
         """The same with motion where segments delayed by (n, M) samples are under way."""
@@ -120,26 +105,11 @@ class PathProblem:
         moving = (inside & valid[..., None]).any(dim=1)
         return replace(self, group=2 * (self.group // 2) + moving)
 
-    def __getitem__(self, rows: Tensor) -> PathProblem:
-        """The problem of some trajectories."""
-        parts = {name: each[rows] for name, each in vars(self).items() if name not in COMMON}
-        return replace(self, **parts)
-
-    @property
-    def width(self) -> float:
-        """Of the range of delays, in samples."""
-        return self.delay_range[1] - self.delay_range[0]
-
     @property
     def bounds(self) -> Bounds:
         """The range of delays, and the largest step, as limits of x."""
         step = MAX_STEP * self.width
         return delay_bounds(self.segments, 1 + self.path.shape[2], self.delay_range, step)
-
-    @property
-    def sample(self) -> Tensor:
-        """All samples (T,)."""
-        return torch.arange(self.segments.steps, dtype=torch.float64)
 
     @property
     def motion_measured(self) -> Tensor:
@@ -154,10 +124,6 @@ class PathProblem:
             for inside in (within(self.sample, start, end) for end in (settle, stop))
         )
         return motion / whole.amax(dim=1, keepdim=True).clamp_min(1e-9)
-
-    def per_segment(self, x: Tensor) -> Tensor:
-        """Values (n, P) by segment, (n, M, 1 + d_y)."""
-        return x.unflatten(1, (self.segments.max_count, -1))
 
     def residual(self, x: Tensor) -> Tensor:
         """Measured minus corrected path (n, T, d_y), 0 where nothing was measured."""
