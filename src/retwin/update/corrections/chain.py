@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -90,24 +90,14 @@ class Chain:
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """Components of the first, then of the second; names of both get the operator's."""
         parts = [(each, each.latent(inputs, outputs)) for each in self._operators]
-        once = Counter(name for _, part in parts for name in part.names)
-        names = [
-            name if once[name] == 1 else f"{type(each).__name__}.{name}"
-            for each, part in parts
-            for name in part.names
-        ]
-        return Channels(tuple(names), tuple(unit for _, part in parts for unit in part.units))
+        names = _distinct([(each, name) for each, part in parts for name in part.names])
+        return Channels(names, tuple(unit for _, part in parts for unit in part.units))
 
     def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
         """Blocks of the first, then of the second, named likewise."""
         parts = [(each, head) for each in self._operators for head in each.heads(inputs, outputs)]
-        once = Counter(head.name for _, head in parts)
-        return tuple(
-            head
-            if once[head.name] == 1
-            else replace(head, name=f"{type(each).__name__}.{head.name}")
-            for each, head in parts
-        )
+        names = _distinct([(each, head.name) for each, head in parts])
+        return tuple(replace(head, name=name) for (_, head), name in zip(parts, names, strict=True))
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """The outputs after all operators, before a sensor records them."""
@@ -151,6 +141,14 @@ class Chain:
             for name, values in (("u", context.commands), ("y", context.nominal))
         )
         return z.split([len(each.latent(inputs, outputs)) for each in self._operators], dim=-1)
+
+
+def _distinct(names: Sequence[tuple[Correction, str]]) -> tuple[str, ...]:
+    """Names, with that of the operator before those that both operators have."""
+    once = Counter(name for _, name in names)
+    return tuple(
+        name if once[name] == 1 else f"{type(each).__name__}.{name}" for each, name in names
+    )
 
 
 def completed(

@@ -8,8 +8,8 @@ motion ends at `settle + TDe` with its own. So the path is continuous whatever z
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -68,6 +68,8 @@ class DelayOffset:
 
     """
 
+    resolution: ClassVar[str] = "segment"
+    """One z per segment."""
     delay_range: tuple[float, float] | None = None
     known_delay: float | None = None
 
@@ -75,11 +77,6 @@ class DelayOffset:
         checked_range(self.delay_range)
         if self.known_delay is not None:
             positive("known_delay", self.known_delay)
-
-    @property
-    def resolution(self) -> str:
-        """One z per segment."""
-        return "segment"
 
     @property
     def pools(self) -> bool:
@@ -121,18 +118,13 @@ class DelayOffset:
         limits = range_in_samples(self.delay_range, context, observed, mask)
         parts = [
             self._infer(context[some], observed[some], mask[some], limits)
-            for some in np.split(
-                np.arange(len(context)),
-                np.arange(TRAJECTORIES_PER_BATCH, len(context), TRAJECTORIES_PER_BATCH),
-            )
+            for some in torch.arange(len(context)).split(TRAJECTORIES_PER_BATCH)
         ]
-        return Discrepancy(
-            torch.cat([part.z for part in parts]),
-            torch.cat([part.covariance for part in parts]),
-            torch.cat([part.identified for part in parts]),
-            torch.cat([part.noise for part in parts]),
-            at_bound=torch.cat([part.at_bound for part in parts if part.at_bound is not None]),
-        )
+        names = ("z", "covariance", "identified", "noise", "at_bound")
+        columns: dict[str, Any] = {
+            name: torch.cat([getattr(part, name) for part in parts]) for name in names
+        }
+        return Discrepancy(**columns)
 
     def _infer(
         self, context: Context, observed: Tensor, mask: Tensor, limits: tuple[float, float]
@@ -207,13 +199,9 @@ def _discrepancy(
     identified = identified & valid[..., None]
     scale = torch.cat([unit.new_ones(1), unit])
     steady = torch.where(problem.measured > 0, noise.scale[problem.group][..., 0], torch.inf)
-    return Discrepancy(
-        z * scale,
-        covariance * scale[:, None] * scale,
-        identified,
-        steady.amin(dim=1) * unit.mean(),
-        at_bound=bounded,
-    )
+    covariance = covariance * scale[:, None] * scale
+    left = steady.amin(dim=1) * unit.mean()
+    return Discrepancy(z * scale, covariance, identified, left, at_bound=bounded)
 
 
 def _moves(problem: PathProblem, z: Tensor, deviation: Tensor) -> Tensor:
@@ -221,9 +209,7 @@ def _moves(problem: PathProblem, z: Tensor, deviation: Tensor) -> Tensor:
 
     A step between two offsets has a place, and so a delay, also where noise alone made it.
     """
-    start, settle = (
-        torch.as_tensor(getattr(problem.segments, each)) for each in ("start", "settle")
-    )
+    start, settle = map(torch.as_tensor, (problem.segments.start, problem.segments.settle))
     way = path_at(problem.segments, problem.path, z).diff(dim=1, prepend=problem.path[:, :1]).abs()
     inside = within(problem.sample, start + z[..., 0], settle + z[..., 0] + 1)
     variance = deviation[..., 1:].square()

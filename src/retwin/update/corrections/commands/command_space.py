@@ -9,6 +9,7 @@ segment altogether: it stays where it is and catches up with the next command.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -52,27 +53,18 @@ class CommandSpace:
 
     """
 
+    resolution: ClassVar[str] = "segment"
+    """One z per segment."""
+    pools: ClassVar[bool] = True
+    """`infer` learns its priors from all trajectories together."""
+    severities: ClassVar[bool] = True
+    """`infer` estimates the severity of a known fault apart from z."""
     delay_range: tuple[float, float] | None = None
     max_samples: int = 200
     identified_below: float = 0.7
 
     def __post_init__(self) -> None:
         checked_range(self.delay_range)
-
-    @property
-    def resolution(self) -> str:
-        """One z per segment."""
-        return "segment"
-
-    @property
-    def pools(self) -> bool:
-        """`infer` learns its priors from all trajectories together."""
-        return True
-
-    @property
-    def severities(self) -> bool:
-        """`infer` estimates the severity of a known fault apart from z."""
-        return True
 
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """`delay` in samples, `offset_…` in the commands' units, `missed_…` 0 or 1."""

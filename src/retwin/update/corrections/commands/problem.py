@@ -189,10 +189,8 @@ class CommandProblem(DelayProblem):
     def held_from(self, frozen: Tensor) -> CommandProblem:
         """The same if faults hold the actuators from other samples (n, d_u) on."""
         start = torch.as_tensor(self.segments.start)[..., None]
-        frozen = frozen.double()
-        return replace(
-            self, frozen=frozen, healthy=self.valid[..., None] & (start < frozen[:, None])
-        )
+        healthy = self.valid[..., None] & (start < frozen[:, None])
+        return replace(self, frozen=frozen.double(), healthy=healthy)
 
     @property
     def where_certain(self) -> CommandProblem:
@@ -278,10 +276,8 @@ class CommandProblem(DelayProblem):
     @property
     def levels(self) -> tuple[Tensor, Tensor]:
         """Commands (n, M, d_u) before and after each segment."""
-        first, last = (
-            interpolate(self.reference, torch.as_tensor(t))
-            for t in (self.segments.start, self.segments.settle)
-        )
+        times = map(torch.as_tensor, (self.segments.start, self.segments.settle))
+        first, last = (interpolate(self.reference, each) for each in times)
         return first, last
 
     @property
@@ -320,9 +316,9 @@ class CommandProblem(DelayProblem):
     @torch.no_grad()
     def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual, and the Jacobian (n, S, d_y, P) of the predicted outputs."""
-        made = self._compiled(x)
+        made = None if self.memory else linearised_outputs(self, x, COMMAND_STEP)
         if made is not None:
-            return self._white(made[0]), self._white(made[1])
+            return self._white(self.observed - made[0]), self._white(made[1])
         parts = [map(part._white, part._linearised(some)) for part, some in self._batches(x)]
         residual, jacobian = zip(*parts, strict=True)
         return torch.cat(residual), torch.cat(jacobian)
@@ -392,26 +388,6 @@ class CommandProblem(DelayProblem):
         if self.own_delays:
             parts.append(torch.einsum("nsyu,nmsu->nsymu", by_command, delay))
         return residual, torch.cat(parts, dim=-1).flatten(3)
-
-    def _compiled(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
-        """As `_linearised`, by a compiled kernel; None where that does not apply."""
-        if self.memory:
-            return None
-        made = linearised_outputs(
-            self.surrogate,
-            self.reference,
-            self.segments,
-            x,
-            self.missed,
-            self.sample,
-            self.frozen,
-            unit=self.unit,
-            step=COMMAND_STEP,
-        )
-        if made is None:
-            return None
-        outputs, jacobian = made
-        return self.observed - outputs, jacobian
 
     def _effective(self, x: Tensor, rows: Tensor) -> Tensor:
         """Effective commands for x (k, M, size) of the trajectories `rows` (k,), in order."""
