@@ -11,6 +11,7 @@ Comput. 4, 415, 1992).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -220,16 +221,8 @@ def solve(
     rows, damping = torch.arange(len(x)), torch.full_like(energy, DAMPING)
     before = torch.zeros_like(x)
     for count in range(MAX_STEPS + 1):
-        step = gauss_newton_step(
-            problem,
-            prior,
-            noise,
-            x,
-            linearised,
-            damping=damping,
-            bounds=bounds,
-            reweightings=reweightings,
-        )
+        how: Any = {"damping": damping, "bounds": bounds, "reweightings": reweightings}
+        step = gauss_newton_step(problem, prior, noise, x, linearised, **how)
         occam = 0.5 * (prior.log_determinant - step.log_determinant)
         done = (energy - step.objective < TOLERANCE) | (count == MAX_STEPS)
         if minimum_evidence is not None and count:
@@ -262,7 +255,14 @@ def solve(
         better = there <= energy
         x = torch.where(better[:, None], trial, x)
         energy = torch.where(better, there, energy)
-        linearised = _chosen(better, tried, linearised)
+        if not better.all():
+            worse = (~better).nonzero()[:, 0]
+            residual, jacobian = (
+                new.index_copy(0, worse, old[worse])
+                for new, old in zip(tried, linearised, strict=True)
+            )
+            tried = residual, jacobian
+        linearised = tried
         raised = (8 * damping).clamp(DAMPING_AFTER_FAILURE, 1e6)
         raised = torch.where(factor > 1, damping, raised)
         damping = torch.where(better, (damping / 4).clamp_min(1e-9), raised)
@@ -324,19 +324,6 @@ def _extrapolation(move: Tensor, before: Tensor, metric: Tensor) -> Tensor:
 def _left(joined: Tensor, move: Tensor) -> Tensor:
     """Residual (R, K d) of the linearised problem after a move (R, P)."""
     return (joined @ torch.cat([-move, torch.ones_like(move[:, :1])], dim=1)[..., None])[..., 0]
-
-
-def _chosen(
-    better: Tensor, new: tuple[Tensor, Tensor], old: tuple[Tensor, Tensor]
-) -> tuple[Tensor, Tensor]:
-    """Residual and Jacobian, new where a step was better."""
-    if better.all():
-        return new
-    worse = (~better).nonzero()[:, 0]
-    return (
-        new[0].index_copy(0, worse, old[0][worse]),
-        new[1].index_copy(0, worse, old[1][worse]),
-    )
 
 
 def _solved(matrix: Tensor, right: Tensor) -> Tensor:
