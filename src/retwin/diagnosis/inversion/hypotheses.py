@@ -158,12 +158,9 @@ class Hypotheses(Rows):
         made = cls(problem, prior, len(faults), actuator, held, size.double(), onsets)
         place, biased = made.offset_index, made.width > 0
         largest = torch.where(biased, made.size[:, 1], torch.inf)
-        extra, limit = (
-            torch.full_like(prior.gaussian.mean, rest).scatter(
-                1, place, own[:, None].expand(place.shape)
-            )
-            for rest, own in ((0.0, made.width.square()), (torch.inf, largest))
-        )
+        none = torch.zeros_like(prior.gaussian.mean)
+        extra = none.scatter(1, place, made.width.square()[:, None].expand_as(place))
+        limit = (none + torch.inf).scatter(1, place, largest[:, None].expand_as(place))
         wide = prior.gaussian.widened(extra)
         limited = LimitedPrior(wide, prior.odds, limit, prior.gaussian.deviation)
         return replace(made, prior=limited).held(onsets[:, 0])

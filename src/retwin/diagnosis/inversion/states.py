@@ -74,9 +74,7 @@ class StateDiagnosis:
     @property
     def labels(self) -> NDArray:
         """The most probable class of each trajectory (n,), or "unknown"."""
-        names = np.array([*self.classes, UNKNOWN])
-        made: NDArray = names[self.evidence.argmax(axis=1)]
-        return made
+        return np.array([*self.classes, UNKNOWN])[self.evidence.argmax(axis=1)]
 
     @property
     def reason(self) -> NDArray:
@@ -120,9 +118,7 @@ class StateInversionDiagnoser:
             )
         check_faults(list(faults.values()), len(twin.inputs), len(twin.outputs), twin.shiftable)
         self.twin = twin
-        self.faults = {
-            name: each if isinstance(each, TimedFault) else None for name, each in faults.items()
-        }
+        self.faults: dict[str, TimedFault | None] = dict(faults)  # type: ignore[arg-type]
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -170,14 +166,9 @@ class StateInversionDiagnoser:
 
         """
         check_channels(self.twin, trajectories, "trajectories")
-        empty = trajectories.ids[~trajectories.mask.any(axis=(1, 2))].tolist()
-        remedy = "leave them out"
-        nothing(
-            "trajectories",
-            map("none in {}".format, empty),
-            "measured samples in each",
-            remedy=remedy,
-        )
+        empty = trajectories.ids[~trajectories.mask.any(axis=(1, 2))]
+        none = (f"none in {each}" for each in empty)
+        nothing("trajectories", none, "measured samples in each", remedy="leave them out")
         found, dispersions = [], []
         single = [trajectories[i : i + 1] for i in range(len(trajectories))]
         for row, dispersion in in_threads(lambda each: self._integrals(each, known_start), single):
@@ -245,10 +236,7 @@ class StateInversionDiagnoser:
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with the twin inside, or nothing."""
-        faults = [
-            [name, None if fault is None else to_config(fault, FAULTS)]
-            for name, fault in self.faults.items()
-        ]
+        faults = [[name, each and to_config(each, FAULTS)] for name, each in self.faults.items()]
         with write_model(folder, "state inversion", {"faults": faults}, {}) as inside:
             self.twin.save(inside / "twin")
 
@@ -257,8 +245,5 @@ class StateInversionDiagnoser:
         """Read what `save` wrote; InputError when it is no such inversion or damaged."""
         about, _ = read_model(folder, "state inversion")
         twin = DynamicsTwin.load(Path(folder) / "twin")
-        faults = {
-            name: None if config is None else from_config(config, FAULTS)
-            for name, config in about["faults"]
-        }
+        faults = {name: each and from_config(each, FAULTS) for name, each in about["faults"]}
         return cls(twin, faults)

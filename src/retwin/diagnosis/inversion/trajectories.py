@@ -8,6 +8,7 @@ explain them best give the severity of the fault.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,15 +215,9 @@ class InversionDiagnoser:
 
     def with_faults(self, more: Mapping[str, Fault | None]) -> InversionDiagnoser:
         """The same with further classes."""
-        return InversionDiagnoser(
-            self.surrogate,
-            self.residual,
-            {**self.faults, **more},
-            noise=self.noise,
-            surrogate_variance=self.surrogate_variance,
-            bound=self.bound,
-            calibration=self.calibration,
-        )
+        made = copy.copy(self)
+        made.faults = checked({**self.faults, **more})
+        return made
 
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes), see `Diagnoser`."""
@@ -285,6 +280,7 @@ class InversionDiagnoser:
         unknown = np.where(missing == "", unknown, 1.0)
         severities = (level, onset / trajectories.rate, bias)
         levels, onsets, offsets = (Estimate(*np.moveaxis(each, -1, 0)) for each in severities)
+        doubts = [missing != "", each > 0.5, unknown > 0.5]
         return Diagnosis(
             self.classes,
             share / share.sum(axis=1, keepdims=True),
@@ -296,9 +292,7 @@ class InversionDiagnoser:
             outside_training(self.surrogate, trajectories),
             unknown,
             offset,
-            np.select(
-                [missing != "", each > 0.5, unknown > 0.5], [missing, named, UNEXPLAINED], ""
-            ),
+            np.select(doubts, [missing, named, UNEXPLAINED], ""),
             each,
         )
 
@@ -317,10 +311,7 @@ class InversionDiagnoser:
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with `surrogate` and `residual` inside, or nothing."""
-        faults = [
-            [name, None if fault is None else to_config(fault, FAULTS)]
-            for name, fault in self.faults.items()
-        ]
+        faults = [[name, each and to_config(each, FAULTS)] for name, each in self.faults.items()]
         about = {"faults": faults, "calibration": to_config(self.calibration, (Calibration,))}
         learned = {
             "scale": self.noise.scale,
@@ -337,12 +328,9 @@ class InversionDiagnoser:
     def load(cls, folder: str | Path) -> InversionDiagnoser:
         """Read what `save` wrote; InputError when it is not an inversion or damaged."""
         about, weights = read_model(folder, "inversion")
-        folder = Path(folder)
+        folder, calibration = Path(folder), about.get("calibration", {"kind": "Calibration"})
         surrogate = load_surrogate(folder / "surrogate")
-        faults = {
-            name: None if config is None else from_config(config, FAULTS)
-            for name, config in about["faults"]
-        }
+        faults = {name: each and from_config(each, FAULTS) for name, each in about["faults"]}
         return cls(
             surrogate,
             ResidualModel.load(folder / "residual"),
@@ -350,9 +338,7 @@ class InversionDiagnoser:
             noise=Noise(weights["scale"], weights["thinning"]),
             surrogate_variance=weights["surrogate_variance"],
             bound=float(weights.get("bound", -np.inf)),
-            calibration=from_config(about["calibration"], (Calibration,))
-            if "calibration" in about
-            else Calibration(),
+            calibration=from_config(calibration, (Calibration,)),
         )
 
 
