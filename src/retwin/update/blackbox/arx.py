@@ -120,15 +120,9 @@ class Linear:
         bound = START * (1.0 + float(np.abs(starts).max()))
         terms = [each.name for each in self.lags.terms]
         names = [f"{own}: {term}" for own in observed.outputs.names for term in terms]
-        return StateTwin(
-            states_within(starts, bound),
-            output,
-            observed.inputs,
-            observed.outputs,
-            observed.rate,
-            step=step,
-            parameters=coefficients_of(names, theta),
-        )
+        channels = observed.inputs, observed.outputs, observed.rate
+        states, parameters = states_within(starts, bound), coefficients_of(names, theta)
+        return StateTwin(states, output, *channels, step=step, parameters=parameters)
 
     def starts(self, theta: NDArray) -> NDArray:
         """States (records, n d_y) at the first samples, as if each record had been at rest."""

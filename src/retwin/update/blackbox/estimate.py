@@ -122,9 +122,8 @@ class BlackBoxFit:
         names = tuple(each.name for each in estimation.twin.states[:corrected])
         made = assembled(estimation, found, names, speed, whole, unmoved)
         uncertain = held_out(estimation, found, held_out_parts(estimation.seen))
-        made = replace(
-            made, widening=widening(made, self._tested, replace(uncertain, errors=self.errors))
-        )
+        factors = widening(made, self._tested, replace(uncertain, errors=self.errors))
+        made = replace(made, widening=factors)
         figures = {
             "order": float(order),
             "parameters": float(estimation.unknowns.count),

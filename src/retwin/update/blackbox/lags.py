@@ -125,10 +125,9 @@ class Lags:
         import torch
 
         n, samples = self.order, self.observed.steps
-        y, u = (
-            each.astype(np.float64) for each in (self.observed.observed, self.observed.commands)
-        )
-        whole: NDArray = np.asarray(self.observed.mask.all(axis=2))
+        pair = self.observed.observed, self.observed.commands
+        y, u = (each.astype(np.float64) for each in pair)
+        whole = np.asarray(self.observed.mask.all(axis=2))
         spans = [whole[:, n - lag : max(n, samples) - lag] for lag in range(n + 1)]
         record, sample = np.nonzero(np.all(spans, axis=0))
         sample = sample + n

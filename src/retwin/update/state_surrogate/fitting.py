@@ -261,7 +261,7 @@ def _twin_of(
     limits = Limits(floats(low), floats(high), "refuse" if limits is None else limits.outside)
 
     def made(starts: NDArray | None) -> StateTwin:
-        return found.equations.twin(twin.inputs, twin.outputs, twin.rate, free, limits, starts)
+        return found.equations.twin(twin, free, limits, starts)
 
     known = made(None)
     if not unknown_start:
@@ -310,12 +310,7 @@ def _test(
         "StateTwin (docs/twins.md#states), or correct the outputs of the twin as it is, without "
         "dynamics",
     )
-    columns = {
-        "rmse": whole * deviation,
-        "nrmse": whole,
-        "nrmse_first": first,
-        "nrmse_last": last,
-    }
+    columns = {"rmse": whole * deviation, "nrmse": whole, "nrmse_first": first, "nrmse_last": last}
     return {
         f"{figure}_{name}": float(each)
         for figure, row in columns.items()
