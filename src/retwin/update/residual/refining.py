@@ -87,15 +87,8 @@ def refine(
     before, start = held_out_score(), copy.deepcopy(model.state_dict())
     for part in frozen:
         part.requires_grad_(False)
-    train(
-        model,
-        loss,
-        (features[fitted], fitted),
-        (features[held_out], held_out),
-        how.training,
-        seed=seed,
-        progress=progress,
-    )
+    sets = (features[fitted], fitted), (features[held_out], held_out)
+    train(model, loss, *sets, how.training, seed=seed, progress=progress)
     for part in frozen:
         part.requires_grad_(True)
     after = held_out_score()

@@ -122,14 +122,8 @@ class Residual(nn.Module, ABC, Generic[D]):
         if segments is None or self.segmentation == "path":
             nominal = surrogate.predict(commands) if self.segmentation == "path" else commands
             segments = segment(commands, nominal, self.segmentation)
-        return Context.of(
-            surrogate,
-            commands,
-            segments,
-            rate=surrogate.rate,
-            faulty_commands=faulty_commands,
-            frozen=frozen,
-        )
+        faulty = {"faulty_commands": faulty_commands, "frozen": frozen}
+        return Context.of(surrogate, commands, segments, rate=surrogate.rate, **faulty)
 
     @abstractmethod
     def forward(self, context: Context) -> Blocks:
@@ -171,13 +165,10 @@ class Residual(nn.Module, ABC, Generic[D]):
         Raises InputError if the folder holds no such residual model or is damaged.
         """
         about, weights = read_model(folder, cls.kind)
-        model = cls(
-            from_config(about["correction"], classes(CORRECTIONS)),
-            from_config(about["density"], _densities()),
-            inputs=Channels.of(about["inputs"]),
-            outputs=Channels.of(about["outputs"]),
-            segmentation=about["segmentation"],
-        )
+        correction = from_config(about["correction"], classes(CORRECTIONS))
+        density = from_config(about["density"], _densities())
+        channels = {name: Channels.of(about[name]) for name in ("inputs", "outputs")}
+        model = cls(correction, density, **channels, segmentation=about["segmentation"])
         model.load_state_dict(weights)
         model.degrees = [
             math.inf if each is None else finite("degrees", each, at_least=1)
