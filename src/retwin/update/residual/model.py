@@ -14,6 +14,7 @@ from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.nets.networks import Standardise
 from retwin.nets.student import Student, shared_factor
 from retwin.update.corrections import Context
+from retwin.update.corrections.warp import gather_samples
 from retwin.update.residual.residual import Residual
 from retwin.update.residual.settings import Density
 
@@ -107,9 +108,8 @@ class ResidualModel(Residual[Density]):
     def predict(self, features: Tensor) -> Blocks:
         """The distribution that the network predicts, before its calibration."""
         encoded = self.encoder(self.before(features))
-        parts = zip(
-            self.heads, self.shift.split(self.sizes), self.scale.split(self.sizes), strict=True
-        )
+        units = (each.split(self.sizes) for each in (self.shift, self.scale))
+        parts = zip(self.heads, *units, strict=True)
         return Blocks([head(encoded, shift, scale) for head, shift, scale in parts])
 
     @torch.no_grad()
@@ -148,14 +148,10 @@ def describe(context: Context) -> Tensor:
     the durations of the motion and of the steady part in s, all of the commands without faults.
     """
     segments = context.segments
-    start, settle, stop = (
-        torch.as_tensor(times) for times in (segments.start, segments.settle, segments.stop)
-    )
-    last = segments.steps - 1
-    columns = []
-    for when in (start, (start + settle) / 2, settle):
-        index = when.round().long().clamp(0, last)[..., None]
-        for values in (context.commands, context.nominal):
-            columns.append(values.gather(1, index.expand(-1, -1, values.shape[2])))
+    start, settle, stop = map(torch.as_tensor, (segments.start, segments.settle, segments.stop))
+    times = (start, (start + settle) / 2, settle)
+    places = [each.round().long().clamp(0, segments.steps - 1) for each in times]
+    values = (context.commands, context.nominal)
+    columns = [gather_samples(each, place) for place in places for each in values]
     lengths = torch.stack([settle - start, stop - settle], dim=-1) / context.rate
     return torch.cat([*columns, lengths.to(context.nominal)], dim=-1)

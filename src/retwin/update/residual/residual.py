@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import ClassVar, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retwin.catalog import CORRECTIONS, DENSITIES, NETWORKS, classes
-from retwin.checks import finite, one_of
+from retwin.checks import finite, one_of, require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import Blocks
@@ -27,6 +27,10 @@ from retwin.update.corrections.commands.machines import Learned
 from retwin.update.surrogate import Surrogate
 
 D = TypeVar("D")
+SMALLEST = 1e-12
+"""Smallest value taken for the largest |z*|: a millionth of it still has a square in float32."""
+BOUND_MARGIN = 1.25
+"""Default bound b of Eq. 9, over the largest |z*|."""
 
 
 class Residual(nn.Module, ABC, Generic[D]):
@@ -134,6 +138,44 @@ class Residual(nn.Module, ABC, Generic[D]):
         """The mean z̄ (n, M, d_z) of Eq. 8, clipped at b."""
         return self(context).mean.clamp(-self.bounds, self.bounds)
 
+    def penalise(self, mean: Tensor, valid: Tensor) -> Tensor:
+        """λ_s times the mean square step of z̄, plus λ_b times that of its excess over b (Eq. 9).
+
+        Steps and excess are in units of `scale`; `density` holds λ_s and λ_b.
+
+        Parameters
+        ----------
+        mean : Tensor
+            (..., n, M, d_z), z̄ over M segments or samples.
+        valid : Tensor
+            (..., n, M) bool, what is averaged over.
+
+        Returns
+        -------
+        Tensor
+            (...).
+
+        """
+        density: Any = self.density
+        step = (mean[..., 1:, :] - mean[..., :-1, :]) / self.scale
+        beyond = torch.relu(mean.abs() - self.bounds) / self.scale
+        roughness = mean_where(step.square().sum(-1), valid[..., 1:] & valid[..., :-1])
+        excess = mean_where(beyond.square().sum(-1), valid)
+        return density.smoothness * roughness + density.boundedness * excess
+
+    def take_bounds(self, bounds: NDArray | None) -> None:
+        """Take the bounds b (d_z,) of a user, if any; InputError unless all are positive."""
+        if bounds is None:
+            return
+        require(
+            np.shape(bounds) == self.bounds.shape and (np.asarray(bounds) > 0).all(),
+            "bounds",
+            expected=f"one positive bound for each of {', '.join(self.latent.names)}",
+            got=repr(bounds),
+            remedy="leave bounds out to take them from the data",
+        )
+        self.bounds.copy_(torch.as_tensor(bounds, dtype=torch.float32))
+
     @abstractmethod
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
         """Draws of z (n, M, d_z), clipped at b."""
@@ -179,6 +221,11 @@ class Residual(nn.Module, ABC, Generic[D]):
         model.fitted = Fit.of(about["fitted"])
         model.learned = about.get("learned")
         return model.eval()
+
+
+def mean_where(values: Tensor, valid: Tensor) -> Tensor:
+    """The mean (...) of values (..., n, M) that are valid."""
+    return torch.where(valid, values, 0.0).sum((-2, -1)) / valid.sum((-2, -1)).clamp_min(1)
 
 
 def _densities() -> tuple[type, ...]:

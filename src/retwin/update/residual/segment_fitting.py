@@ -18,7 +18,7 @@ from retwin.nets.student import widening
 from retwin.nets.training import Fit, Training, train
 from retwin.progress import part_of
 from retwin.update.residual.model import ResidualModel
-from retwin.update.residual.penalties import BOUND_MARGIN, SMALLEST, checked_bounds, penalties
+from retwin.update.residual.residual import BOUND_MARGIN, SMALLEST
 from retwin.update.residual.targets import ResidualTask, Targets
 
 HELD_OUT = 20
@@ -250,8 +250,7 @@ def _prepare(model: ResidualModel, targets: Targets, bounds: NDArray | None, see
         model.shift[part], model.scale[part] = shift, scale
         model.bounds[part] = BOUND_MARGIN * largest
         head.initialise(((values - shift) / scale).double().numpy(), seed)
-    if bounds is not None:
-        model.bounds.copy_(checked_bounds(bounds, model.latent))
+    model.take_bounds(bounds)
 
 
 def _objective(model: Any, batch: tuple[Tensor, ...]) -> Tensor:
@@ -261,4 +260,4 @@ def _objective(model: Any, batch: tuple[Tensor, ...]) -> Tensor:
     # Blocks that are not identified hold a finite placeholder and are not in the likelihood.
     log_prob = torch.where(identified, distribution.block_log_prob(z), 0.0).sum()
     nll = -log_prob / identified.sum().clamp_min(1) * identified.shape[-1]
-    return nll + penalties(model, distribution.mean, valid)
+    return nll + model.penalise(distribution.mean, valid)

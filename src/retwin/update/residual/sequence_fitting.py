@@ -14,13 +14,7 @@ from retwin.checks import require
 from retwin.nets.mixtures import Blocks
 from retwin.nets.training import Fit, Loss, isolated, train
 from retwin.progress import Progress, part_of
-from retwin.update.residual.penalties import (
-    BOUND_MARGIN,
-    SMALLEST,
-    checked_bounds,
-    mean_where,
-    penalties,
-)
+from retwin.update.residual.residual import BOUND_MARGIN, SMALLEST, mean_where
 from retwin.update.residual.sequence import (
     SequenceMixture,
     SequenceResidual,
@@ -182,8 +176,7 @@ def _prepare(model: SequenceResidual, data: _Records, bounds: NDArray | None, se
     largest = values.abs().amax(dim=0).clamp_min(SMALLEST)
     model.scale.copy_(values.std(dim=0, correction=0).maximum(1e-6 * largest))
     model.bounds.copy_(BOUND_MARGIN * largest)
-    if bounds is not None:
-        model.bounds.copy_(checked_bounds(bounds, model.latent))
+    model.take_bounds(bounds)
     _initialise(model, data, seed)
 
 
@@ -206,7 +199,7 @@ def _objective(model: SequenceResidual) -> Loss:
         used, distribution = flags.movedim(-1, 0), Blocks(model.predict(features))
         deviation = (distribution.variance.sqrt() / model.scale).detach().mean(dim=-1)
         nll = -distribution.log_prob(z) * deviation ** (2 * density.moderation)
-        return (mean_where(nll, used) + penalties(model, distribution.mean, used)).sum()
+        return (mean_where(nll, used) + model.penalise(distribution.mean, used)).sum()
 
     return loss
 

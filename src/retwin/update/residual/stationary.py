@@ -11,8 +11,7 @@ from retwin.checks import require
 from retwin.nets.mixtures import Blocks, GaussianMixture
 from retwin.nets.training import Fit
 from retwin.update.corrections import Context
-from retwin.update.residual.penalties import SMALLEST
-from retwin.update.residual.residual import Residual
+from retwin.update.residual.residual import SMALLEST, Residual
 from retwin.update.residual.sequence import autoregressive
 from retwin.update.residual.sequence_fitting import MAX_PERSISTENCE
 from retwin.update.residual.targets import ResidualTask
