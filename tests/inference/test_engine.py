@@ -13,11 +13,10 @@ from torch import Tensor
 
 from retwin.inference import solver
 from retwin.inference.em import expectation_maximisation
-from retwin.inference.evidence import added_evidence, best_per_row
 from retwin.inference.losses import StudentT, Tukey
 from retwin.inference.noise import Noise, common_rounding, correlation_time
 from retwin.inference.priors import GaussianPrior
-from retwin.inference.solver import Bounds, Solution, solve
+from retwin.inference.solver import Bounds, Solution, added_evidence, best_per_row, solve
 
 pytestmark = pytest.mark.numerical
 

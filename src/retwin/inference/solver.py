@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -102,6 +103,20 @@ def blocks(covariance: Tensor, count: int) -> Tensor:
     """Covariance of each of `count` parts of x, (R, count, P / count, P / count), of (R, P, P)."""
     whole = covariance.unflatten(2, (count, -1)).unflatten(1, (count, -1))
     return whole.diagonal(dim1=1, dim2=3).movedim(-1, 1).clone()
+
+
+def best_per_row(evidence: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """The rows among `rows` (k,), each once, and the index (·,) of the best alternative of each."""
+    order = torch.as_tensor(np.lexsort((evidence.numpy(), rows.numpy())))
+    different, counts = torch.unique_consecutive(rows[order], return_counts=True)
+    return different, order[counts.cumsum(dim=0) - 1]
+
+
+def added_evidence(total: Tensor, evidence: Tensor, rows: Tensor) -> Tensor:
+    """Log sum (R,) of the evidence that each row had and of that (k,) of its alternatives."""
+    top = total.scatter_reduce(0, rows, evidence, "amax")
+    share = (total - top).exp().index_add(0, rows, (evidence - top[rows]).exp())
+    return top + share.log()
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from retwin.inference.evidence import added_evidence, best_per_row
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
 from retwin.inference.problem import Rows
-from retwin.inference.solver import Solution, solve
+from retwin.inference.solver import Solution, added_evidence, best_per_row, solve
 from retwin.update.corrections.commands.problem import CommandProblem
 
 SEARCHES = 3
