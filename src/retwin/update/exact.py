@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from retwin import catalog
 from retwin.checks import given, require
 from retwin.data.trajectories import Trajectories
-from retwin.progress import Progress
 from retwin.serialisation.models import kind_of, read_about, refusing, save_model
 from retwin.twins.equations.saved_equations import equations_from, equations_of
 from retwin.twins.equations.state import State
@@ -57,13 +56,12 @@ class ExactSurrogate(OfTwin):
         self.twin = twin
         self._warns = differences
 
-    def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
+    def predict(self, commands: NDArray) -> NDArray:
         """The nominal outputs (n, T, d_y), float32, for commands (n, T, d_u)."""
         values = np.asarray(commands, np.float64)
         if isinstance(self.twin, DynamicsTwin):  # whose simulations have noise besides
             return self.twin.simulation.most_probable(values)[0].astype(np.float32)
-        made = self.twin.simulate(values, seed=0, progress=progress)
-        return made.nominal.astype(np.float32)
+        return self.twin.simulate(values, seed=0).nominal.astype(np.float32)
 
     @property
     def unknown_starts(self) -> bool:

@@ -115,17 +115,17 @@ class Surrogate(nn.Module):
         """The outputs (n, T, d_y) for commands (n, T, d_u), both in physical units."""
         return self.after.inverse(self.network(self.before(commands)))
 
-    def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
+    def predict(self, commands: NDArray) -> NDArray:
         """The outputs (n, T, d_y), float32, for commands (n, T, d_u), without gradient.
 
         A network without memory is evaluated once for a constant command, and at a few points of a
         ramp (`evaluate_piecewise_linear`), which agrees with `forward` up to rounding.
         """
         with training_checked(self, commands):
-            return self._predict(commands, progress)
+            return self._predict(commands)
 
     @torch.no_grad()
-    def _predict(self, commands: NDArray, progress: Progress | None = None) -> NDArray:
+    def _predict(self, commands: NDArray) -> NDArray:
         """As `predict`, without a check of the commands."""
         values = np.ascontiguousarray(commands, dtype=np.float32)
         out = np.empty((*values.shape[:2], len(self.outputs)), dtype=np.float32)
@@ -136,8 +136,6 @@ class Surrogate(nn.Module):
         for begin in range(0, len(values), size):
             part = slice(begin, begin + size)
             out[part] = evaluate(torch.tensor(values[part])).numpy()
-            if progress is not None:
-                progress(min(1.0, (begin + size) / len(values)))
         return out
 
     def _piecewise_linear(self, commands: Tensor) -> Tensor:
