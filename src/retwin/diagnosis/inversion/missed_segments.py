@@ -6,6 +6,7 @@ trade time for accuracy.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import cast
 
 import torch
@@ -37,10 +38,7 @@ def best_fit(
     are tried as missed by every actuator that was to move. Rows that cannot come near the best of
     their trajectory are left alone.
     """
-
-    def suspects(fit: CommandFit, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return _suspects(problem, fit, prior, noise, trajectory, rows)
-
+    suspects = partial(_suspects, problem, prior, noise, trajectory)
     return searched(problem, prior, noise, CommandFit.of_prior(problem, prior, start), suspects)
 
 
@@ -69,10 +67,10 @@ def fitted_noise(problem: CommandProblem, prior: LatentPrior, *, rounds: int) ->
 
 def _suspects(
     problem: CommandProblem,
-    fit: CommandFit,
     prior: LatentPrior,
     noise: Noise,
     trajectory: Tensor,
+    fit: CommandFit,
     rows: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Row, segment and actuator of all that is worth trying as missed."""

@@ -195,11 +195,9 @@ def _inside(
 ) -> tuple[Tensor, Tensor]:
     """Standard normal draws for which |centre + scale z| is between the limits, and that mass."""
     ndtr, ndtri = torch.special.ndtr, torch.special.ndtri
-    ends = [((low - centre) / scale, (high - centre) / scale)]
-    ends.append(((-high - centre) / scale, (-low - centre) / scale))
-    masses, draws = [], []
-    shares = []
-    for begin, end in ends:
+    masses, draws, shares = [], [], []
+    for first, last in ((low, high), (-high, -low)):
+        begin, end = (first - centre) / scale, (last - centre) / scale
         # The upper tail is turned over: far out, only the lower one has digits left.
         upper = begin > 0
         left, right = torch.where(upper, -end, begin), torch.where(upper, -begin, end)

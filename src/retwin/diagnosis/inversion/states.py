@@ -30,8 +30,6 @@ from retwin.twins.twin import check_channels
 from retwin.update.dynamics import DynamicsTwin
 from retwin.workers.threads import in_threads
 
-__all__ = ["StateDiagnosis", "StateInversionDiagnoser"]
-
 UNEXPLAINED = "larger noise than in calibration explains the outputs better than every class"
 """The reason for which a trajectory is unknown."""
 KINDS = tuple(kind for kind in FAULTS if issubclass(kind, TimedFault))

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
@@ -179,15 +178,11 @@ def best_order(
             progress(0.9 * done / len(orders))
         if best is not None and order - best[0] >= PATIENCE:
             break
-    if best is None:
-        raise InputError(
-            "observed",
-            expected="records by which a model of past samples can be simulated",
-            got="records with which every order diverges in free simulation, or in which too few "
-            "samples follow each other",
-            remedy="give longer records, with all outputs measured at consecutive samples",
-        )
-    return best
+    expected = "records by which a model of past samples can be simulated"
+    got = "records with which every order diverges in free simulation, or in which too few samples "
+    got += "follow each other"
+    remedy = "give longer records, with all outputs measured at consecutive samples"
+    return given("observed", best, expected, got=got, remedy=remedy)
 
 
 def held_out_parts(seen: NDArray) -> list[NDArray]:

@@ -317,13 +317,12 @@ class Hyperparameters:
         samples = self.samples.learned(white, self.noise, x)
         white = replace(white, whitening=samples.whitening())
         likelihood = Likelihood.of(solution, self.hierarchy.prior(design)).weighted(weight)
-        return Hyperparameters(
-            self.features,
-            self.hierarchy.learned(design, likelihood),
-            _odds(problem, self.missed),
-            samples,
-            self._noise(white, solution),
-            self.missed,
+        return replace(
+            self,
+            hierarchy=self.hierarchy.learned(design, likelihood),
+            odds=_odds(problem, self.missed),
+            samples=samples,
+            noise=self._noise(white, solution),
         )
 
     def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
