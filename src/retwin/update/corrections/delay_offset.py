@@ -15,7 +15,6 @@ from torch import Tensor
 
 from retwin.checks import positive
 from retwin.data.trajectories import Channels
-from retwin.inference.em import expectation_maximisation
 from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
@@ -85,9 +84,8 @@ class DelayOffset:
 
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """`delay` in samples, then one offset per output in its unit."""
-        return Channels(
-            ("delay", *(f"offset_{name}" for name in outputs.names)), ("samples", *outputs.units)
-        )
+        names = ("delay", *(f"offset_{name}" for name in outputs.names))
+        return Channels(names, ("samples", *outputs.units))
 
     def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
         """A mixture for the delay, another for the offset (section 4.2.3)."""
@@ -140,24 +138,19 @@ class DelayOffset:
         z[..., 1:] = problem.first_offset(limits[1])
         z[..., 0] = first_delays(problem, z.flatten(1), limits)
         problem = problem.with_motion(z[..., 0])
-        bounds = problem.bounds
-        learned = _learned(problem, problem.residual(z.flatten(1)))
+        x = z.flatten(1)
+        noise, prior = _learned(problem, problem.residual(x))
         # A fast motion half a sample beside the grid is beyond the cutoff of Tukey's loss, and the
         # rounding of the few samples that count would decide where its delay goes from there.
-        first = replace(learned[0], loss=StudentT()), learned[1]
-        solution, learned = expectation_maximisation(
-            Solution.of_prior(learned[1], z.flatten(1)),
-            first,
-            infer=lambda found, given: solve(
-                problem, given[1], given[0], found.x, bounds=bounds, reweightings=1
-            ),
-            learn=lambda found, _: _learned(problem, problem.residual(found.x)),
-            rounds=ROUNDS,
-        )
+        noise = replace(noise, loss=StudentT())
+        for _ in range(ROUNDS):
+            solution = solve(problem, prior, noise, x, bounds=problem.bounds, reweightings=1)
+            x = solution.x
+            noise, prior = _learned(problem, problem.residual(x))
         known = KNOWN_DELAY * problem.width
         if self.known_delay is not None:
             known = self.known_delay * context.rate
-        found = _discrepancy(problem, solution, *learned, unit, known)
+        found = _discrepancy(problem, solution, noise, prior, unit, known)
         if context.surrogate_variance is None:
             return found
         # At rest the surrogate's error is an offset.
