@@ -75,6 +75,11 @@ class GaussianMixture(MixtureSameFamily, Block):
         weights = Categorical(logits=logits, validate_args=False)
         super().__init__(weights, components, validate_args=False)
 
+    @property
+    def parts(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The logits, means and factors of which it is made."""
+        return self.mixture_distribution.logits, self.means, self.factor
+
     def expand(
         self, batch_shape: Sequence[int], _instance: Distribution | None = None
     ) -> GaussianMixture:
@@ -82,11 +87,8 @@ class GaussianMixture(MixtureSameFamily, Block):
         shape = torch.Size(batch_shape)
         if shape == self.batch_shape:
             return self
-        return GaussianMixture(
-            self.mixture_distribution.logits.expand(*shape, -1),
-            self.means.expand(*shape, -1, -1),
-            self.factor.expand(*shape, -1, -1, -1),
-        )
+        size = len(self.batch_shape)
+        return GaussianMixture(*(each.expand(*shape, *each.shape[size:]) for each in self.parts))
 
     def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
         """A draw (..., D) as a function of noise, which gives the same draw on every device.
@@ -111,8 +113,7 @@ class GaussianMixture(MixtureSameFamily, Block):
         """The same with all deviations from the mean multiplied by `factor` (..., D)."""
         middle, factor = self.mean[..., None, :], factor[..., None, :]
         means = middle + factor * (self.means - middle)
-        logits = self.mixture_distribution.logits
-        return GaussianMixture(logits, means, factor[..., None] * self.factor)
+        return GaussianMixture(self.parts[0], means, factor[..., None] * self.factor)
 
     def marginal_cdf(self, value: Tensor) -> Tensor:
         """The marginal probabilities P(z_d <= value_d), (..., D): the PIT of `value`."""
@@ -205,7 +206,7 @@ class Blocks(Block):
 
     def block_log_prob(self, value: Tensor) -> Tensor:
         """Log density of each block at its part of `value` (..., D), (..., blocks)."""
-        return torch.stack([block.log_prob(part) for block, part in self._with(value)], dim=-1)
+        return torch.stack([block.log_prob(part) for block, part in self._split(value)], dim=-1)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density (...) at `value` (..., D)."""
@@ -228,13 +229,13 @@ class Blocks(Block):
 
     def normal_scores(self, value: Tensor) -> Tensor:
         """The quantiles (..., D) of the standard normal at the PIT of `value` (..., D)."""
-        return torch.cat([block.normal_scores(part) for block, part in self._with(value)], dim=-1)
+        return torch.cat([block.normal_scores(part) for block, part in self._split(value)], dim=-1)
 
     def widened(self, factor: Tensor) -> Blocks:
         """The same with all deviations from the mean multiplied by `factor` (D,), but of events."""
-        return Blocks([block.widened(part) for block, part in self._with(factor)])
+        return Blocks([block.widened(part) for block, part in self._split(factor)])
 
-    def _with(self, value: Tensor) -> Iterator[tuple[Block, Tensor]]:
+    def _split(self, value: Tensor) -> Iterator[tuple[Block, Tensor]]:
         """Each block, with its part of `value` (..., D)."""
         return zip(self.blocks, value.split(self.widths, dim=-1), strict=True)
 

@@ -137,15 +137,12 @@ class _Recurrent(nn.Module):
         self.readout = nn.Sequential(
             nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, outputs)
         )
+        self.last_layers = (self.readout[-1],)
 
     def forward(self, values: Tensor) -> Tensor:
         # The read-out has the present input too, so the memory need not represent it.
         remembered, _ = self.memory(values)
         return self.readout(torch.cat([remembered, self.direct(values)], dim=-1))
-
-    @property
-    def last_layers(self) -> tuple[nn.Module, ...]:
-        return last_layers(self.readout)
 
 
 @dataclass(frozen=True)
@@ -185,6 +182,7 @@ class _Convolutional(nn.Module):
             nn.Conv1d(config.channels, config.channels, 1) for _ in range(config.levels)
         )
         self.leave = nn.Conv1d(config.channels, outputs, 1)
+        self.last_layers = (self.leave,)
 
     def forward(self, values: Tensor) -> Tensor:
         state = self.enter(values.transpose(1, 2))
@@ -194,10 +192,6 @@ class _Convolutional(nn.Module):
             past = functional.pad(state, (padding, 0), mode="replicate")
             state = state + mix(functional.silu(convolution(past)))
         return self.leave(functional.silu(state)).transpose(1, 2)
-
-    @property
-    def last_layers(self) -> tuple[nn.Module, ...]:
-        return (self.leave,)
 
 
 @dataclass(frozen=True)
@@ -242,6 +236,7 @@ class _States(nn.Module):
             nn.Linear(states, hidden), nn.SiLU(), nn.Linear(hidden, outputs)
         )
         self.skip = nn.Linear(states, outputs, bias=False)
+        self.last_layers = (self.readout[-1], self.skip)
         with torch.no_grad():
             self.now.weight[:states] = -torch.eye(states)
 
@@ -256,10 +251,6 @@ class _States(nn.Module):
             state = state + inverse_times * (linear + self.move(torch.tanh(inside)))
         trajectory = torch.stack(states, dim=1)
         return self.skip(trajectory) + self.readout(trajectory)
-
-    @property
-    def last_layers(self) -> tuple[nn.Module, ...]:
-        return self.readout[-1], self.skip
 
 
 @dataclass(frozen=True)
