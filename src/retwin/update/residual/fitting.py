@@ -147,17 +147,14 @@ def fit_residual(
     """
     surrogate = exact_surrogate(surrogate)
     others = other_machines(prior, correction, surrogate)
-    instance(
-        "calibration", calibration, Trajectories, remedy="load recorded ones, or simulate a twin"
-    )
+    remedy = "load recorded ones, or simulate a twin"
+    instance("calibration", calibration, Trajectories, remedy=remedy)
     remedy = "load the file with its case, or convert it"
     agree("calibration", calibration, surrogate, "that of the surrogate", remedy=remedy)
-    stepwise = correction.resolution == "step" or isinstance(
-        density, SequenceMixture | StationaryNoise
-    )
-    keep, faults = _chosen(
-        calibration, calibrate_on, getattr(correction, "severities", False), 1 if stepwise else 3
-    )
+    by_sample = isinstance(density, SequenceMixture | StationaryNoise)
+    stepwise = correction.resolution == "step" or by_sample
+    severities = getattr(correction, "severities", False)
+    keep, faults = _chosen(calibration, calibrate_on, severities, 1 if stepwise else 3)
     used = calibration[keep]
     missing = "; ".join(filter(None, [unmeasured(used), doubtful(used)]))
     if missing:
@@ -244,9 +241,8 @@ def _fit_per_segment(task: ResidualTask, density: Density, rule: str) -> Residua
     rows = (healthy & (context.frozen >= context.commands.shape[1]).all(dim=1)).nonzero().flatten()
     if len(rows):
         model.eval()
-        figures |= coverage_figures(
-            model, context[rows.numpy()], observed[rows], sampled[rows], seed=task.seed
-        )
+        some = context[rows.numpy()], observed[rows], sampled[rows]
+        figures |= coverage_figures(model, *some, seed=task.seed)
     model.fitted = replace(result, figures=figures | result.figures)
     return model
 

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from retwin.checks import require
 from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.nets.networks import Standardise
 from retwin.nets.student import Student, shared_factor
@@ -44,16 +43,12 @@ class ResidualModel(Residual[Density]):
     """
 
     kind = "residual"
-
-    def _check_correction(self) -> None:
-        require(
-            getattr(self.correction, "resolution", "") == "segment",
-            "correction",
-            expected="an operator with one z per segment",
-            got=repr(self.correction),
-            remedy="use DelayOffset, CommandSpace, or a Chain of one with a SampledSensor; or, for "
-            "one z per sample, a SequenceMixture as the density",
-        )
+    resolution = "segment"
+    wanted = "an operator with one z per segment"
+    remedy = (
+        "use DelayOffset, CommandSpace, or a Chain of one with a SampledSensor; or, for one z per "
+        "sample, a SequenceMixture as the density"
+    )
 
     def _build(self) -> None:
         features, density = 3 * (len(self.inputs) + len(self.outputs)) + 2, self.density
@@ -100,10 +95,8 @@ class ResidualModel(Residual[Density]):
         # A graph that is exported has no branches that depend on values.
         if torch.compiler.is_compiling() or bool((self.spread != 1).any()):
             predicted = predicted.widened(self.spread)
-        parts = zip(predicted.blocks, self.degrees, strict=True)
-        return Blocks(
-            [block if math.isinf(degrees) else Student(block, degrees) for block, degrees in parts]
-        )
+        pairs = zip(predicted.blocks, self.degrees, strict=True)
+        return Blocks([own if math.isinf(free) else Student(own, free) for own, free in pairs])
 
     def predict(self, features: Tensor) -> Blocks:
         """The distribution that the network predicts, before its calibration."""

@@ -74,6 +74,10 @@ class Residual(nn.Module, ABC, Generic[D]):
 
     kind: ClassVar[str]
     """Kind of the saved model."""
+    resolution: ClassVar[str] = "step"
+    """That of the operators whose z it can have: with a z per sample, none of it is an event."""
+    wanted: ClassVar[str] = "an operator with one z per sample, none of it an event"
+    remedy: ClassVar[str] = "use Additive, or a density such as Mixture for one z per segment"
     spread: Tensor
 
     def __init__(
@@ -91,7 +95,16 @@ class Residual(nn.Module, ABC, Generic[D]):
         self.inputs = inputs
         self.outputs = outputs
         self.segmentation = segmentation
-        self._check_correction()
+        suits = getattr(correction, "resolution", "") == self.resolution
+        if suits and self.resolution == "step":
+            suits = all(each.kind == "mixture" for each in correction.heads(inputs, outputs))
+        require(
+            suits,
+            "correction",
+            expected=self.wanted,
+            got=repr(correction),
+            remedy=self.remedy,
+        )
         self.latent = correction.latent(inputs, outputs)
         self.sizes = [head.width for head in correction.heads(inputs, outputs)]
         self.degrees = [math.inf] * len(self.sizes)
@@ -106,28 +119,20 @@ class Residual(nn.Module, ABC, Generic[D]):
         self._build()
 
     @abstractmethod
-    def _check_correction(self) -> None:
-        """Raise InputError for an operator whose z this model cannot have."""
-
-    @abstractmethod
     def _build(self) -> None:
         """Make the networks, with random initial weights, and further buffers."""
 
     def context(
-        self,
-        surrogate: Surrogate,
-        commands: NDArray,
-        segments: Segments | None = None,
-        *,
-        faulty_commands: NDArray | None = None,
-        frozen: NDArray | None = None,
+        self, surrogate: Surrogate, commands: NDArray, segments: Segments | None = None, **more: Any
     ) -> Context:
-        """The context of commands (n, T, d_u), with segments by this model's rule unless given."""
+        """The context of commands (n, T, d_u), with segments by this model's rule unless given.
+
+        `faulty_commands` and `frozen` are those of `Context.of`.
+        """
         if segments is None or self.segmentation == "path":
             nominal = surrogate.predict(commands) if self.segmentation == "path" else commands
             segments = segment(commands, nominal, self.segmentation)
-        faulty = {"faulty_commands": faulty_commands, "frozen": frozen}
-        return Context.of(surrogate, commands, segments, rate=surrogate.rate, **faulty)
+        return Context.of(surrogate, commands, segments, rate=surrogate.rate, **more)
 
     @abstractmethod
     def forward(self, context: Context) -> Blocks:

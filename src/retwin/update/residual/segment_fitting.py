@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from torch import Tensor
 
-from retwin.nets.mixtures import BernoulliHead
+from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.nets.student import widening
 from retwin.nets.training import Fit, Training, train
 from retwin.progress import part_of
@@ -33,6 +33,9 @@ QUANTILE = float(stats.norm.ppf((1 + LEVEL) / 2))
 """Normal score at the end of that interval."""
 PERSISTENCES = np.linspace(0.0, 0.95, 96)
 """Values of the persistence that are equally probable before the data."""
+
+Predicted = list[tuple[Blocks, Targets]]
+"""What models predict for trajectories that they were not trained on, and the z of these."""
 
 
 def fit_segments(model: ResidualModel, targets: Targets, task: ResidualTask) -> tuple[Fit, Tensor]:
@@ -75,8 +78,9 @@ def fit_segments(model: ResidualModel, targets: Targets, task: ResidualTask) -> 
         own = part_of(task.progress, k, runs)
         fits.append(_trained(member, parts[rest], parts[held_out], replace(task, progress=own)))
     with torch.no_grad():
-        unseen = [(each, parts[fold]) for each, fold in zip(members, folds, strict=True)]
-        spread = _spread(unseen)
+        pairs = zip(members, map(parts.__getitem__, folds), strict=True)
+        unseen = [(each.predict(part.features), part) for each, part in pairs]
+        spread = _spread(model, unseen)
         persistence = _persistence(unseen, single=len(rows) == 1)
     if len(folds) > 1:
         epochs = round(float(np.mean([fit.best_epoch for fit in fits])))
@@ -91,8 +95,8 @@ def fit_segments(model: ResidualModel, targets: Targets, task: ResidualTask) -> 
     needed = spread * _deviation(unseen)
     if len(rows) == 1:
         # Deviations that were learned from half a trajectory are chance: the errors are a bound.
-        needed = torch.minimum(needed, _errors(unseen, model.scale))
-    ratio = needed / _deviation([(model, part) for _, part in unseen])
+        needed = torch.minimum(needed, _errors(model, unseen))
+    ratio = needed / _deviation([(model.predict(part.features), part) for _, part in unseen])
     model.spread.copy_(torch.where(model.events, 1.0, ratio.clamp_min(1.0)))
     model.degrees = _degrees(model, targets, persistence)
     if task.bounds is None:
@@ -124,20 +128,18 @@ def _trained(
     return train(model, _objective, *sets, how, seed=task.seed, progress=task.progress)
 
 
-def _spread(held_out: list[tuple[ResidualModel, Targets]]) -> Tensor:
+def _spread(model: ResidualModel, held_out: Predicted) -> Tensor:
     """The factors (d_z,) with which intervals hold held-out z as often as they should, per block.
 
     By coverage and not by likelihood, which a single missed segment would dominate.
     """
-    predicted = [(model.predict(part.features), part) for model, part in held_out]
-    model = held_out[0][0]
     spread = torch.ones(len(model.latent))
     narrow = [block for head, block in model.parts() if not isinstance(head, BernoulliHead)]
     for factor in SPREADS.tolist():
         for block in narrow:
             spread[block] = factor
         held, used = [], []
-        for distribution, part in predicted:
+        for distribution, part in held_out:
             scores = distribution.widened(torch.full_like(spread, factor)).normal_scores(part.z)
             held.append((scores.abs() <= QUANTILE).float().mean(dim=0) * part.used)
             used.append(part.used)
@@ -149,38 +151,38 @@ def _spread(held_out: list[tuple[ResidualModel, Targets]]) -> Tensor:
 
 
 @torch.no_grad()
-def _deviation(held_out: list[tuple[ResidualModel, Targets]]) -> Tensor:
+def _deviation(held_out: Predicted) -> Tensor:
     """Geometric mean of the deviations (d_z,) that models predict for held-out segments."""
-    variances = [model.predict(part.features).variance[part.valid] for model, part in held_out]
+    variances = [distribution.variance[part.valid] for distribution, part in held_out]
     return (0.5 * torch.cat(variances).log().mean(dim=0)).exp()
 
 
 @torch.no_grad()
-def _errors(held_out: list[tuple[ResidualModel, Targets]], unit: Tensor) -> Tensor:
+def _errors(model: ResidualModel, held_out: Predicted) -> Tensor:
     """The deviations (d_z,) of normal distributions as wide as the errors of held-out z.
 
-    Components of a block have the same deviation in their units (d_z,).
+    Components of a block have the same deviation in their units, `ResidualModel.scale`.
     """
-    parts = [(part, model.predict(part.features).mean) for model, part in held_out]
-    error = torch.cat([((part.z - mean) / unit).abs() for part, mean in parts], dim=1)
-    used = torch.cat([part.used for part, _ in parts])
+    unit = model.scale
+    error = torch.cat([((part.z - own.mean) / unit).abs() for own, part in held_out], dim=1)
+    used = torch.cat([part.used for _, part in held_out])
     found = torch.full_like(unit, torch.inf)
-    for _, block in held_out[0][0].parts():
+    for _, block in model.parts():
         own = error[:, used[..., block].any(dim=-1)][..., block].flatten()
         if len(own):
             found[block] = own.quantile(LEVEL) / QUANTILE
     return found * unit
 
 
-def _persistence(held_out: list[tuple[ResidualModel, Targets]], *, single: bool) -> Tensor:
+def _persistence(held_out: Predicted, *, single: bool) -> Tensor:
     """Correlation (d_z,) of normal scores between the segments of a trajectory.
 
     It is the mean of its posterior given the ratio of the variances between and within held-out
     trajectories (one-way analysis of variance), all values being equally probable before the data.
     """
     scores, used = [], []
-    for model, part in held_out:
-        score = model.predict(part.features).normal_scores(part.z).mean(dim=0)
+    for distribution, part in held_out:
+        score = distribution.normal_scores(part.z).mean(dim=0)
         score = torch.where(part.used, score, torch.nan)
         # The error of a prediction from the other folds is in the mean of a fold, K / (K - 1) of
         # what the mean of all trajectories would leave there.

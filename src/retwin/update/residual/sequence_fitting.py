@@ -216,9 +216,8 @@ def _calibrate(model: SequenceResidual, data: _Records, held_out: Tensor) -> dic
     predicted = shrunk(predicted, model.shift.split(model.sizes), model.trust.split(model.sizes))
 
     def with_spread(spread: float) -> Blocks:
-        return Blocks(
-            scale_deviations(predicted, torch.full_like(model.spread, spread).split(model.sizes))
-        )
+        own = torch.full_like(model.spread, spread).split(model.sizes)
+        return Blocks(scale_deviations(predicted, own))
 
     def log_likelihood(spread: float) -> float:
         return float(with_spread(spread).log_prob(data.z)[held_out].sum())

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from retwin.checks import require
 from retwin.nets.mixtures import Blocks, GaussianMixture
 from retwin.nets.training import Fit
 from retwin.update.corrections import Context
@@ -40,20 +39,11 @@ class StationaryResidual(Residual[StationaryNoise]):
     Raises
     ------
     InputError
-        The operator has no z per sample.
+        The operator has no z per sample, or an event among its components.
 
     """
 
     kind = "stationary residual"
-
-    def _check_correction(self) -> None:
-        require(
-            self.correction.resolution == "step",
-            "correction",
-            expected="an operator with one z per sample",
-            got=repr(self.correction),
-            remedy="use Additive",
-        )
 
     def _build(self) -> None:
         self.spread = nn.Buffer(torch.ones(len(self.latent)))
