@@ -166,16 +166,6 @@ class Hypotheses(Rows):
         return replace(made, prior=limited).held(onsets[:, 0])
 
     @property
-    def trajectory(self) -> Tensor:
-        """The trajectory of each row (R,)."""
-        return torch.arange(len(self.actuator)) // self.classes
-
-    @property
-    def stuck(self) -> Tensor:
-        """Whether the row's actuator is stuck (R,) bool."""
-        return self.onsets[:, 0] < self.problem.reference.shape[1]
-
-    @property
     def width(self) -> Tensor:
         """Standard deviation of a bias (R,); 0 where there is none."""
         low, high = self.size.unbind(dim=1)

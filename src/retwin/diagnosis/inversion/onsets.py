@@ -78,9 +78,8 @@ class Onsets(Rows):
         at = evidence.unflatten(0, shape).argmax(dim=1, keepdim=True)
         own = evidence.unflatten(0, shape).gather(1, at)[:, 0]
         best = best.unflatten(0, shape).gather(1, at)[:, 0]
-        samples, weight, prior = (
-            each.unflatten(0, shape).flatten(1) for each in (samples, weight, prior)
-        )
+        columns = (samples, weight, prior)
+        samples, weight, prior = (each.unflatten(0, shape).flatten(1) for each in columns)
         probability = weight.softmax(dim=1)
         information = torch.special.xlogy(probability, probability / prior).sum(dim=1)
         return cls(samples, probability, best, weight.logsumexp(dim=1) - own, information)

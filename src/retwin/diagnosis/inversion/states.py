@@ -21,7 +21,7 @@ from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.estimate import Estimate, ImplausibleError
 from retwin.diagnosis.inversion.adaptive_grid import Integral
 from retwin.diagnosis.inversion.fault_evidence import NOTHING, FaultEvidence
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults.actuator_faults import Fault
@@ -91,6 +91,11 @@ class StateInversionDiagnoser:
         Class name to fault, None for healthy, in the order of the probabilities. What a fault
         leaves open, as a pair (low, high), is inferred.
 
+    Attributes
+    ----------
+    classes : tuple of str
+        Class names, in the order of the probabilities.
+
     Raises
     ------
     InputError
@@ -116,12 +121,8 @@ class StateInversionDiagnoser:
             )
         check_faults(list(faults.values()), len(twin.inputs), len(twin.outputs), twin.shiftable)
         self.twin = twin
+        self.classes = tuple(faults)
         self.faults: dict[str, TimedFault | None] = dict(faults)  # type: ignore[arg-type]
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Class names, in the order of the probabilities."""
-        return tuple(self.faults)
 
     def with_faults(self, more: Mapping[str, Fault | None]) -> StateInversionDiagnoser:
         """The same with further classes."""
@@ -167,13 +168,9 @@ class StateInversionDiagnoser:
         empty = trajectories.ids[~trajectories.mask.any(axis=(1, 2))]
         none = (f"none in {each}" for each in empty)
         nothing("trajectories", none, "measured samples in each", remedy="leave them out")
-        found, dispersions = [], []
         single = [trajectories[i : i + 1] for i in range(len(trajectories))]
-        for row, dispersion in in_threads(lambda each: self._integrals(each, known_start), single):
-            found.append(row)
-            dispersions.append(dispersion)
-            if progress is not None:
-                progress(len(found) / len(trajectories))
+        rows = in_threads(lambda each: self._integrals(each, known_start), single)
+        found, dispersions = zip(*tracked(rows, len(single), progress), strict=True)
         evidence = np.array([[each.evidence for each in row] for row in found])
         if not np.isfinite(evidence).any(axis=1).all():
             raise ImplausibleError(
