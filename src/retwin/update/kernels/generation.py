@@ -44,14 +44,10 @@ def along_pieces(surrogate: Any, commands: NDArray) -> NDArray | None:
     return out
 
 
-def at_effective_commands(
-    surrogate: Any, reference: Tensor, segments: Segments, z: Tensor, when: Tensor, frozen: Tensor
-) -> Tensor | None:
-    """The outputs (n, S, d_y) at the samples `when` (n, S) of effective commands.
-
-    See `effective_commands` for the other arguments.
-    """
-    kernel, packed = library(), _pack(surrogate)
+def at_effective_commands(context: Any, z: Tensor, when: Tensor) -> Tensor | None:
+    """The outputs (n, S, d_y) at the samples `when` (n, S) of effective commands of a `Context`."""
+    reference, segments, frozen = context.faulty_commands, context.segments, context.frozen
+    kernel, packed = library(), _pack(context.surrogate)
     plain = _plain(reference, z) and not when.is_floating_point() and len(reference) == len(z)
     if kernel is None or packed is None or not plain or not reference.numel():
         return None
