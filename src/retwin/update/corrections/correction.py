@@ -125,7 +125,7 @@ class Context(Rows):
         own = getattr(self.surrogate, "unit", self.scale)
         return self.nominal.new_ones(self.nominal.shape[2]) if own is None else own
 
-    def __getitem__(self, index: slice | NDArray) -> Context:
+    def __getitem__(self, index: slice | NDArray | Tensor) -> Context:
         """The context of some of the trajectories."""
         return Rows.__getitem__(replace(self, corrected=self.path), index)
 

@@ -53,6 +53,15 @@ class DelayProblem(Rows, ABC):
         """Values (R, P) or (R, P, …) by segment, (R, M, P / M, …), the delay first."""
         return x.unflatten(1, (self.segments.max_count, -1))
 
+    def at_rest(self, margin: float) -> Tensor:
+        """(R, M, K) bool, the samples at rest, `margin` samples after the motion.
+
+        Of a short rest its second half counts.
+        """
+        settle, stop = map(torch.as_tensor, (self.segments.settle, self.segments.stop))
+        begin = settle + torch.full_like(settle, margin).minimum((stop - settle) / 2)
+        return within(self.sample, begin, stop.ceil() - 1)
+
     @abstractmethod
     def residual(self, x: Tensor) -> Tensor:
         """See `Problem`."""

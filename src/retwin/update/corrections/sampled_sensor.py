@@ -121,7 +121,7 @@ class SampledSensor:
             every, phases = _timing(observed, mask)
         else:
             every, known = self.timing(rate)
-            phases = known or _found_phases(_kinks(_bends(observed, mask), every))
+            phases = known or _list_phases(_kinks(_bends(observed, mask), every))
         made = replace(self, period=every / rate, phases=tuple(each / rate for each in phases))
         if made.steps is not None:
             return made
@@ -241,7 +241,7 @@ def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:
         kinks = _kinks(bends, every)
         plain = _plain(kinks)
         if 2 * plain.sum() > (kinks.amax(dim=1) > 0).sum():
-            return every, _found_phases(kinks)
+            return every, _list_phases(kinks)
     return 1, (0,)
 
 
@@ -280,7 +280,7 @@ def _phases(kinks: Tensor) -> Tensor:
     return own if not plain.any() else torch.where(plain, own, own[plain].mode().values)
 
 
-def _found_phases(kinks: Tensor) -> tuple[int, ...]:
+def _list_phases(kinks: Tensor) -> tuple[int, ...]:
     """The phases that trajectories have, in order."""
     return tuple(sorted(set(_phases(kinks).tolist())))
 

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from retwin.update.corrections.commands.problem import CommandProblem
-from retwin.update.corrections.warp import within
 
 
 @torch.no_grad()
@@ -32,7 +31,8 @@ def first_missed(problem: CommandProblem, deviation: Tensor, odds: float) -> Ten
         Log odds that an actuator misses a segment.
 
     """
-    missed, rest = problem.missed.clone(), _rest(problem)
+    missed, margin = problem.missed.clone(), max(problem.delay_range[1], 0.0)
+    rest = problem.at_rest(margin) & (problem.measured > 0)[:, None]
     if not rest.any():
         return missed
     precision = _precision(problem, rest, deviation)
@@ -68,14 +68,6 @@ def _flipped(missed: Tensor, healthy: Tensor, m: int) -> list[Tensor]:
     changes = torch.eye(missed.shape[2], dtype=missed.dtype)
     tried = [*((missed[:, m] - each * healthy).abs() for each in changes), healthy.to(missed)]
     return [missed.index_copy(1, torch.tensor([m]), each[:, None]) for each in tried]
-
-
-def _rest(problem: CommandProblem) -> Tensor:
-    """(n, M, S) bool, samples at rest after a segment; of a short rest its second half."""
-    settle, stop = map(torch.as_tensor, (problem.segments.settle, problem.segments.stop))
-    margin = torch.full_like(settle, max(problem.delay_range[1], 0.0))
-    begin = settle + margin.minimum((stop - settle) / 2)
-    return within(problem.sample, begin, stop.ceil() - 1) & (problem.measured > 0)[:, None]
 
 
 def _precision(problem: CommandProblem, rest: Tensor, deviation: Tensor) -> Tensor:

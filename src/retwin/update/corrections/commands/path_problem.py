@@ -84,11 +84,10 @@ class PathProblem(DelayProblem):
         observed = torch.where(available, observed, 0.0)
         # Paths are computed in single precision, whose rounding is the same at rest too.
         single = SINGLE * path.abs().amax(dim=(0, 1))
+        columns = observed.flatten(0, 1).T, available.flatten(0, 1).T, single
         steps = [
             max(lattice_step(each[seen].numpy()), float(least))
-            for each, seen, least in zip(
-                observed.flatten(0, 1).T, available.flatten(0, 1).T, single, strict=True
-            )
+            for each, seen, least in zip(*columns, strict=True)
         ]
         rounding = math.hypot(*steps) / math.sqrt(12)
         sample, given = torch.arange(segments.steps, dtype=torch.float64), (path, available)
@@ -97,9 +96,8 @@ class PathProblem(DelayProblem):
 
     def with_motion(self, delay: Tensor) -> PathProblem:
         """The same with motion where segments delayed by (n, M) samples are under way."""
-        start, settle, valid = (
-            torch.as_tensor(getattr(self.segments, name)) for name in ("start", "settle", "valid")
-        )
+        start, settle = map(torch.as_tensor, (self.segments.start, self.segments.settle))
+        valid = torch.as_tensor(self.segments.valid)
         before, after = (self.width * each for each in AROUND)
         inside = within(self.sample, start + delay - before, settle + delay + after)
         moving = (inside & valid[..., None]).any(dim=1)
@@ -119,17 +117,14 @@ class PathProblem(DelayProblem):
         """
         start, settle, stop = self.segments.start, self.segments.settle, self.segments.stop
         seen = self.available.any(dim=-1)[:, None]
-        motion, whole = (
-            (inside * seen).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
-            for inside in (within(self.sample, start, end) for end in (settle, stop))
-        )
+        parts = [within(self.sample, start, end) for end in (settle, stop)]
+        motion, whole = ((e * seen).sum(dim=-1) / e.sum(dim=-1).clamp_min(1) for e in parts)
         return motion / whole.amax(dim=1, keepdim=True).clamp_min(1e-9)
 
     def residual(self, x: Tensor) -> Tensor:
         """Measured minus corrected path (n, T, d_y), 0 where nothing was measured."""
-        return self.factor * (
-            self.observed - path_at(self.segments, self.path, self.per_segment(x))
-        )
+        corrected = path_at(self.segments, self.path, self.per_segment(x))
+        return self.factor * (self.observed - corrected)
 
     def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual, and the Jacobian (n, T, d_y, P) of the corrected path."""
@@ -159,10 +154,7 @@ class PathProblem(DelayProblem):
 
         Of a short rest its second half is used.
         """
-        settle, stop = torch.as_tensor(self.segments.settle), torch.as_tensor(self.segments.stop)
-        begin = settle + torch.minimum(torch.full_like(settle, margin), (stop - settle) / 2)
-        inside = within(self.sample, begin, stop.ceil() - 1)
-        there = inside[..., None] & self.available[:, None]
+        there = self.at_rest(margin)[..., None] & self.available[:, None]
         values = torch.where(there, (self.observed - self.path)[:, None], torch.nan)
         return torch.nan_to_num(torch.nanmedian(values, dim=2).values)
 
@@ -188,6 +180,5 @@ class PathProblem(DelayProblem):
         common = common_rounding(scales[1].square(), self.rounding**2) / rest.square()
         same = common * (self.measured * ~moving).sum(dim=1)
         segments = torch.as_tensor(self.segments.valid).sum(dim=1).clamp_min(1)
-        return replace(
-            noise, thinning=torch.stack([time.maximum(same / segments), time], dim=1).flatten()
-        )
+        thinning = torch.stack([time.maximum(same / segments), time], dim=1).flatten()
+        return replace(noise, thinning=thinning)

@@ -363,9 +363,8 @@ class CommandProblem(DelayProblem):
 
     def _residual(self, x: Tensor) -> Tensor:
         commands = self.commands(x)
-        if self.memory:
-            return self.observed - self.predicted(commands).double() / self.unit
-        return self.observed - outputs_at(self.surrogate, commands).double() / self.unit
+        outputs = self.predicted(commands) if self.memory else outputs_at(self.surrogate, commands)
+        return self.observed - outputs.double() / self.unit
 
     def _linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if self.memory:
