@@ -56,9 +56,8 @@ def best_linear(
 ) -> tuple[Linear, BlackBoxFit]:
     """The linear model of the best order, and its fit."""
     check_records(observed)
-    order, fit = best_order(
-        range(1, MAX_ORDER + 1), lambda n: Linear(Lags(observed, n, 1)).fit(), progress
-    )
+    orders = range(1, MAX_ORDER + 1)
+    order, fit = best_order(orders, lambda n: Linear(Lags(observed, n, 1)).fit(), progress)
     return Linear(Lags(observed, order, 1)), fit
 
 
@@ -86,10 +85,8 @@ class Linear:
         width, inputs, n = self.sizes
         begin = 1 + n * width
         by_outputs = [theta[:, 1 + i * width : 1 + (i + 1) * width] for i in range(n)]
-        by_commands = [
-            theta[:, begin + i * inputs : begin + (i + 1) * inputs] for i in range(n + 1)
-        ]
-        return theta[:, 0], by_outputs, [by_commands[n], *by_commands[:n]]
+        places = (begin + i * inputs for i in (n, *range(n)))
+        return theta[:, 0], by_outputs, [theta[:, place : place + inputs] for place in places]
 
     def twin(self, theta: NDArray) -> StateTwin:
         """The model in observer form, its parameters beginning at coefficients (d_y, k)."""

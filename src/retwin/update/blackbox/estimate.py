@@ -25,6 +25,7 @@ from retwin.update.dynamics.fitting import assembled
 from retwin.update.dynamics.left_out import held_out
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
+from retwin.update.forecast_errors import value_range
 
 FOLDS = 10
 """Parts of the calibration record, each made of blocks of all trajectories, that are held out."""
@@ -115,8 +116,8 @@ class BlackBoxFit:
         estimation, point = self.estimation, self.point
         steps = np.diff(estimation.simulated(point)[1], axis=1)
         speed = np.sqrt(np.mean(steps**2, axis=(0, 1)))
-        found = estimation.linearised(point)
         speed, whole = np.where(speed > 0, speed, 1.0), [np.full(estimation.seen.shape[:2], True)]
+        found = estimation.linearised(point)
         unmoved = np.zeros((1, estimation.unknowns.count))
         names = tuple(each.name for each in estimation.twin.states[:corrected])
         made = assembled(estimation, found, names, speed, whole, unmoved)
@@ -143,11 +144,8 @@ def check_records(observed: Trajectories) -> None:
 
     """
     checked_stride(observed, observed, None, "observed")  # type: ignore[arg-type]  # its channels
-    fixed = [
-        name
-        for i, name in enumerate(observed.outputs.names)
-        if np.unique(observed.observed[..., i][observed.mask[..., i]]).size < 2
-    ]
+    low, high = value_range(np.where(observed.mask, observed.observed, np.nan))
+    fixed = [name for name, same in zip(observed.outputs.names, low == high, strict=True) if same]
     require(
         not fixed and len(observed.inputs) > 0,
         "observed",

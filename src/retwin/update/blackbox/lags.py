@@ -95,10 +95,8 @@ class Lags:
     def domain(self) -> Domain:
         """Ranges of the variables."""
         y, u = self.outputs, self.commands
-        low, high, mean = (
-            np.concatenate([*[a] * self.order, *[b] * (self.order + 1)])
-            for a, b in ((y.low, u.low), (y.high, u.high), (y.mean, u.mean))
-        )
+        n, pairs = self.order, ((y.low, u.low), (y.high, u.high), (y.mean, u.mean))
+        low, high, mean = (np.concatenate([*[a] * n, *[b] * (n + 1)]) for a, b in pairs)
         return Domain(low, high, mean, np.ones(len(self.names)))
 
     @cached_property

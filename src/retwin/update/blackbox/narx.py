@@ -62,11 +62,10 @@ def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> Bl
     each explains beyond those before it. They have a Gaussian prior about 0.
     """
     check_records(observed)
-
-    def fit(order: int) -> BlackBoxFit | None:
-        return Polynomial(Lags(observed, order, DEGREE)).fit()
-
-    order, found = best_order(range(1, MAX_ORDER + 1), fit, progress)
+    orders = range(1, MAX_ORDER + 1)
+    order, found = best_order(
+        orders, lambda n: Polynomial(Lags(observed, n, DEGREE)).fit(), progress
+    )
     return found.model(order, len(observed.outputs))
 
 

@@ -154,7 +154,7 @@ class Equations:
         """
         names = [f"{name}{i + 1}" for name, each in self.arrays.items() for i in range(each.size)]
         weights = coefficients_of(names, self.flat)
-        step, output = self._functions(lambda u, p: ([*u], self.at(torch.stack([*p]))))
+        step, output = self._make_functions(lambda u, p: ([*u], self.at(torch.stack([*p]))))
         states, channels = states or self._states(), (made.inputs, made.outputs, made.rate)
         return StateTwin(states, output, *channels, step=step, parameters=weights)
 
@@ -166,13 +166,13 @@ class Equations:
         `starts` (2, d_x) are the bounds of the states at the first sample, where it is unknown.
         """
         constant = {name: torch.tensor(each) for name, each in self.arrays.items()}
-        step, output = self._functions(lambda u, p: ([*u, *p], constant))
+        step, output = self._make_functions(lambda u, p: ([*u, *p], constant))
         return StateTwin(
             self._states(starts), output, like.inputs, like.outputs, like.rate,
             step=step, parameters=parameters, limits=limits, learned=True,
         )  # fmt: skip
 
-    def _functions(
+    def _make_functions(
         self, given: Callable[[Any, Any], tuple[list[Any], dict[str, Any]]]
     ) -> tuple[Callable[..., Any], Callable[..., Any]]:
         """The step and the output of a `StateTwin`; `given` makes v and weights of its u and p."""
@@ -237,10 +237,8 @@ def _linear(v: NDArray, y: NDArray, order: int) -> Linear:
     states = directions[:, :order].reshape(len(v), count, -1) * np.sqrt(len(predicted))
     states = np.pad(states, ((0, 0), (0, 0), (0, order - states.shape[2])))
     now = np.concatenate([states, window(v, [lags]), one], axis=2)
-    flow, read = (
-        np.linalg.lstsq(rows(columns), rows(target), rcond=DISTINCT)[0].T
-        for columns, target in ((now[:, :-1], states[:, 1:]), (now, window(y, [lags])))
-    )
+    pairs = (now[:, :-1], states[:, 1:]), (now, window(y, [lags]))
+    flow, read = (np.linalg.lstsq(rows(a), rows(b), rcond=DISTINCT)[0].T for a, b in pairs)
     parts = [(each[:, :order], each[:, order:-1], each[:, -1]) for each in (flow, read)]
     (a, b, c), (out, direct, e) = parts
     modulus = float(np.abs(np.linalg.eigvals(a)).max())

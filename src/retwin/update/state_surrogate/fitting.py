@@ -126,14 +126,8 @@ class FittedStateSurrogate:
 
     def save(self, folder: str | Path) -> None:
         """Write the equations and the figures; no code of the twin is needed to read them."""
-        about = {
-            "equations": equations_of(self.twin),
-            "figures": self.figures,
-            "history": {str(order): error for order, error in self.history.items()},
-            "seconds": self.seconds,
-            "reason": self.reason,
-        }
-        save_model(folder, KIND, about, {})
+        about = {name: each for name, each in vars(self).items() if name != "twin"}
+        save_model(folder, KIND, {"equations": equations_of(self.twin), **about}, {})
 
     @classmethod
     def load(cls, folder: str | Path) -> FittedStateSurrogate:
