@@ -202,12 +202,9 @@ def generate(
         onsets = twin.onsets
     for_commands, for_twin = np.random.SeedSequence(seed).spawn(2)
     faults = [fault for fault in case.faults.values() for _ in range(per_class)]
-    commands = case.sampler.sample(
-        len(faults), rng=np.random.default_rng(for_commands), onsets=onsets
-    )
+    rng, own = np.random.default_rng(for_commands), int(for_twin.generate_state(1)[0])
+    commands = case.sampler.sample(len(faults), rng=rng, onsets=onsets)
     commands.flags.writeable = False  # no twin changes them, so that none needs a copy
-    made = twin.simulate(
-        commands, faults=faults, seed=int(for_twin.generate_state(1)[0]), progress=progress
-    )
+    made = twin.simulate(commands, faults=faults, seed=own, progress=progress)
     # The names of the classes are the case's; a fault has none.
     return made.replace(labels=np.repeat(case.classes, per_class))

@@ -25,7 +25,7 @@ from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.twins.wrappers.wrapper import OfTwin
 from retwin.update.dynamics.estimation import estimate_starts
 from retwin.update.dynamics.twin import DynamicsTwin
-from retwin.update.dynamics.unknowns import Unknowns, state_names, state_twin_of, unknowns_of
+from retwin.update.dynamics.unknowns import state_names, state_twin_of, unknowns_of
 from retwin.update.surrogate import Surrogate
 
 KIND = "twin"
@@ -68,13 +68,10 @@ class ExactSurrogate(OfTwin):
         """Whether it has a state whose start is not known, which `started` infers."""
         if isinstance(self.twin, DynamicsTwin):
             return self.twin.unknown_starts
-        return bool(state_names(self.twin)) and len(self._starts.free) > 0
-
-    @property
-    def _starts(self) -> Unknowns:
-        """The starts of the states of a `StateTwin`, at its present values."""
+        if not state_names(self.twin):
+            return False
         base, _, values = state_twin_of(self.twin)  # type: ignore[arg-type]
-        return unknowns_of(base, (), values)
+        return len(unknowns_of(base, (), values).free) > 0
 
     def started(self, record: Trajectories) -> ExactSurrogate:
         """The same with the unknown starts of one record; see `DynamicsTwin.started`."""
@@ -82,7 +79,7 @@ class ExactSurrogate(OfTwin):
             return ExactSurrogate(self.twin.started(record), differences=self._warns)
         check_channels(self.twin, record, "record")
         base, _, values = state_twin_of(self.twin)  # type: ignore[arg-type]
-        unknowns = self._starts
+        unknowns = unknowns_of(base, (), values)
         starts, _ = estimate_starts(base, record, unknowns)
         names = [f"start_{base.states[i].name}" for i in unknowns.free]
         own = values | dict(zip(names, starts.tolist(), strict=True))
@@ -127,7 +124,8 @@ class ExactSurrogate(OfTwin):
             return
         about: dict[str, Any] = {}
         if state_names(self.twin):
-            about["equations"] = equations_of(with_present_values(self.twin))  # type: ignore[arg-type]
+            base, _, values = state_twin_of(self.twin)  # type: ignore[arg-type]
+            about["equations"] = equations_of(_at_values(base, values))
         else:
             expected = "a StateTwin, or a surrogate, which can be opened again"
             remedy = "fit a surrogate of it (fit_surrogate)"
@@ -179,13 +177,8 @@ def load_surrogate(folder: str | Path, twin: Twin | None = None) -> Surrogate:
     return Surrogate.load(folder)
 
 
-def with_present_values(twin: StateTwin | ParametricTwin) -> StateTwin:
-    """The equations of a twin, whose parameters and states start at its present values."""
-    base, _, values = state_twin_of(twin)
-    return _at_values(base, values)
-
-
 def _at_values(base: StateTwin, values: Mapping[str, float]) -> StateTwin:
+    """The equations of a twin, whose parameters and states start at some values."""
     return replace(
         base,
         parameters=tuple(each.with_start(values[each.name]) for each in base.parameters),

@@ -114,7 +114,7 @@ class ForecastErrors:
     @property
     def values(self) -> dict[str, Any]:
         """As JSON values; an infinite time is null."""
-        return {name: _plain(each) for name, each in vars(self).items()}
+        return {name: _to_json(each) for name, each in vars(self).items()}
 
     @classmethod
     def of(cls, values: Mapping[str, Any] | None) -> ForecastErrors | None:
@@ -150,7 +150,7 @@ class ForecastErrors:
         )
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     """A field as JSON values, infinite numbers as null."""
     if isinstance(value, np.ndarray):
         made = value.astype(object)

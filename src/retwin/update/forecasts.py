@@ -153,19 +153,14 @@ def forecasts(twin: Twin, record: Trajectories, leads: Sequence[int]) -> Forecas
     free = free_moments(twin, record.commands)[0]
     error = np.where(record.mask, record.observed - free, np.nan)
     mean, last = (np.full((len(leads), *free.shape), np.nan) for _ in range(2))
-    present = _last_measured(error)
+    steps = np.arange(error.shape[1])[:, None]
+    place = np.maximum.accumulate(np.where(np.isfinite(error), steps, 0), axis=1)
+    present = np.take_along_axis(error, place, axis=1)  # at each sample, the last that is no NaN
     for i, lead in enumerate(leads):
         if lead < free.shape[1]:
             mean[i, :, lead:] = free[:, lead:]
             last[i, :, lead:] = present[:, :-lead]
     return Forecasts(np.where(np.isfinite(last), mean, np.nan), last)
-
-
-def _last_measured(error: NDArray) -> NDArray:
-    """At each sample, the last error (n, T, d_y) that is no NaN."""
-    steps = np.arange(error.shape[1])[:, None]
-    place = np.maximum.accumulate(np.where(np.isfinite(error), steps, 0), axis=1)
-    return np.take_along_axis(error, place, axis=1)
 
 
 def _from_states(twin: DynamicsTwin, record: Trajectories, leads: Sequence[int]) -> NDArray:

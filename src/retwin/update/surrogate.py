@@ -68,6 +68,8 @@ class Surrogate(nn.Module):
 
     Attributes
     ----------
+    memoryless : bool
+        Whether an output depends on the command at the same sample only.
     fitted : Fit or None
         Record of the training; None before it.
     trained : CommandRange or None
@@ -87,13 +89,9 @@ class Surrogate(nn.Module):
         self.before = Standardise(len(inputs))
         self.after = Standardise(len(outputs))
         self.network = network.build(len(inputs), len(outputs))
+        self.memoryless = isinstance(network, MLP)
         self.fitted: Fit | None = None
         self.trained: CommandRange | None = None
-
-    @property
-    def memoryless(self) -> bool:
-        """Whether an output depends on the command at the same sample only."""
-        return isinstance(self.config, MLP)
 
     @property
     def held_out_variance(self) -> Tensor:
