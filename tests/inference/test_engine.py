@@ -12,12 +12,10 @@ from scipy.stats import multivariate_normal, multivariate_t, norm
 from torch import Tensor
 
 from retwin.inference import solver
-from retwin.inference.em import expectation_maximisation
-from retwin.inference.evidence import added_evidence, best_per_row
 from retwin.inference.losses import StudentT, Tukey
 from retwin.inference.noise import Noise, common_rounding, correlation_time
 from retwin.inference.priors import GaussianPrior
-from retwin.inference.solver import Bounds, Solution, solve
+from retwin.inference.solver import Bounds, Solution, added_evidence, best_per_row, solve
 
 pytestmark = pytest.mark.numerical
 
@@ -233,14 +231,9 @@ def test_noise_is_learned_by_group() -> None:
         group=(torch.arange(samples) >= 100).long().expand(40, -1),
     )
     residual = torch.tensor(error)
-    first = replace(Noise.from_median(problem, residual, groups=2), loss=GAUSSIAN)
-    _, noise = expectation_maximisation(
-        None,
-        first,
-        infer=lambda state, noise: None,
-        learn=lambda _, noise: noise.learned(problem, residual, common=0.1, blocks=400),
-        rounds=20,
-    )
+    noise = replace(Noise.from_median(problem, residual, groups=2), loss=GAUSSIAN)
+    for _ in range(20):
+        noise = noise.learned(problem, residual, common=0.1, blocks=400)
     wanted = torch.tensor([[0.3, 2.0], [0.9, 6.0]], dtype=torch.float64)
     torch.testing.assert_close(noise.scale, wanted, rtol=0.05, atol=0)
     # Of the 4000 samples of each group ten make a block, which has a common error besides.

@@ -213,7 +213,7 @@ class Hierarchy:
         Effects of conditions are as uncertain as they are: those that nothing shows are free.
         """
         effect = torch.where(design.kind == CONDITION, self.covariance.diagonal(), 0.0)
-        variances = self._variances(design) + design.features.square() @ effect
+        variances = self.scatter(design) + design.features.square() @ effect
         return GaussianPrior.independent(design.features @ self.coefficients, variances)
 
     def posterior_covariance(self, design: Design, likelihood: Likelihood) -> Tensor:
@@ -223,12 +223,8 @@ class Hierarchy:
 
     def information(self, design: Design, likelihood: Likelihood) -> Tensor:
         """(R, F, F) the information of each row about the coefficients, with x integrated out."""
-        weighted = design.features / self._variances(design)[..., None]
+        weighted = design.features / self.scatter(design)[..., None]
         return weighted.mT @ (design.features - self._posterior(design, likelihood).moved)
-
-    def scatter(self, design: Design) -> Tensor:
-        """(R, P) variances of x when the coefficients are known."""
-        return self._variances(design)
 
     def total(self) -> Tensor:
         """(G,) variances of x about the regression, under conditions that have no replicate."""
@@ -285,13 +281,14 @@ class Hierarchy:
                 yield given, found
             given = given._draw_variances(design, found, rng)
 
-    def _variances(self, design: Design) -> Tensor:
+    def scatter(self, design: Design) -> Tensor:
+        """(R, P) variances of x when the coefficients are known."""
         own, effect = self.variance[design.group], self.common[design.group]
         return (own + effect * design.single) * design.wider.square()
 
     def _posterior(self, design: Design, likelihood: Likelihood) -> _Posterior:
         """The posterior of x and β for these variances."""
-        features, variances = design.features, self._variances(design)
+        features, variances = design.features, self.scatter(design)
         x, slope = likelihood.x, likelihood.slope
         precision = variances.reciprocal()
         # In prior standard deviations: what exact outputs leave open keeps the prior's precision
@@ -355,14 +352,13 @@ class Hierarchy:
         beta = found.draw_coefficients(rng)
         noise = normal(found.origin, rng)[..., None]
         noise = torch.linalg.solve_triangular(found.factor.mT, noise, upper=True)[..., 0]
-        x = found.origin + found.moved @ beta + self._variances(design).sqrt() * noise
+        x = found.origin + found.moved @ beta + self.scatter(design).sqrt() * noise
         error = (x - design.features @ beta) / design.wider
         own, effect = self._parts(design)
         both = own * effect * self.total()[design.group]
         part = effect * error + both.sqrt() * normal(error, rng)
-        return self._update_variances(
-            design, (error - part).square(), part.square(), beta.square(), rng
-        )
+        sums = (error - part).square(), part.square()
+        return self._update_variances(design, *sums, beta.square(), rng)
 
     def _parts(self, design: Design) -> tuple[Tensor, Tensor]:
         """Shares (R, P) of a variable's variance that are the error's and the condition's."""
@@ -385,13 +381,12 @@ class Hierarchy:
         def sum_by_group(values: Tensor) -> Tensor:
             return zero.index_add(0, design.group, values.sum(dim=0))
 
-        variance = self._variance(
-            design,
-            sum_by_group(error * used),
-            sum_by_group(used),
-            self.expected.error or self._usual(design, self.variance, rng),
-            rng,
-        )
+        def update(total: Tensor, count: Tensor, usual: Variances) -> Tensor:
+            found = _scaled(total + usual.count * usual.expected, count + usual.count, rng)
+            return found.minimum((LARGEST * design.unit).square())
+
+        usual = self.expected.error or self._usual(design, self.variance, rng)
+        variance = update(sum_by_group(error * used), sum_by_group(used), usual)
         total, count = sum_by_group(effect * single), sum_by_group(single)
         shown = ((design.features * used[..., None]).abs().sum(dim=(0, 1)) > 0).to(beta)
         shown = shown * (design.kind == CONDITION)
@@ -400,14 +395,13 @@ class Hierarchy:
         common = self.common
         if (design.kind == CONDITION).any():
             usual = self.expected.effect or self._usual(design, self.common, rng)
-            common = self._variance(design, total, count, usual, rng)
+            common = update(total, count, usual)
         some = design.kind != CONDITION
         kind, owner = design.kind[some], design.owner[some]
         share = beta[some] / design.unit[owner].square()
         nothing = torch.zeros_like(self.relative)
-        sums, counts = (
-            nothing.index_add(0, kind, each) for each in (share, torch.ones_like(share))
-        )
+        sums = nothing.index_add(0, kind, share)
+        counts = nothing.index_add(0, kind, torch.ones_like(share))
         expected = design.share * _level(design, variance + common)
         relative = _scaled(sums + FREEDOM * expected, counts + FREEDOM, rng).clamp_max(LARGEST**2)
         return replace(self, variance=variance, common=common, relative=relative)
@@ -418,18 +412,6 @@ class Hierarchy:
         expected = design.unit.square().clone()
         expected[first:last] *= _level(design, before, rng)
         return Variances(expected, torch.full_like(expected, FREEDOM))
-
-    def _variance(
-        self,
-        design: Design,
-        total: Tensor,
-        count: Tensor,
-        usual: Variances,
-        rng: np.random.Generator | None,
-    ) -> Tensor:
-        """Variances (G,) of which sums of squares and numbers of values are known."""
-        found = _scaled(total + usual.count * usual.expected, count + usual.count, rng)
-        return found.minimum((LARGEST * design.unit).square())
 
 
 def normal(like: Tensor, rng: np.random.Generator) -> Tensor:

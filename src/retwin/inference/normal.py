@@ -52,23 +52,16 @@ def compiled_step(
     there, objective = np.empty((rows, size)), np.empty(rows)
     curvature, determinant = np.empty((rows, size, size)), np.empty(rows)
     done = np.empty(rows, np.uint8)
-    given = (
-        *_samples(problem),
-        *map(_doubles, (residual, jacobian, x, prior.mean, prior.precision)),
-        None if damping is None else _doubles(damping),
-    )
-    call(
-        kernel,
-        "gauss_newton",
-        (rows, samples, outputs, size, noise.scale.shape[1], reweightings),
-        loss.freedom,
-        [*map(_doubles, (noise.scale, noise.thinning, *limits))],
-        (*given, there, objective, curvature, determinant, done),
-    )
+    tensors = residual, jacobian, x, prior.mean, prior.precision
+    damped = None if damping is None else _doubles(damping)
+    given = (*_samples(problem), *map(_doubles, tensors), damped)
+    sizes = rows, samples, outputs, size, noise.scale.shape[1], reweightings
+    common = [*map(_doubles, (noise.scale, noise.thinning, *limits))]
+    made = there, objective, curvature, determinant
+    call(kernel, "gauss_newton", sizes, loss.freedom, common, (*given, *made, done))
     if not done.all():
         return None
-    made = map(torch.from_numpy, (there, objective, curvature, determinant))
-    return tuple(made)  # type: ignore[return-value]
+    return tuple(map(torch.from_numpy, made))  # type: ignore[return-value]
 
 
 def compiled_objective(
@@ -84,14 +77,9 @@ def compiled_objective(
     rows, samples, outputs = residual.shape
     objective = np.empty(rows)
     given = map(_doubles, (residual, x, prior.mean, prior.precision))
-    call(
-        kernel,
-        "objectives",
-        (rows, samples, outputs, x.shape[1], noise.scale.shape[1]),
-        loss.freedom,
-        [_doubles(noise.scale), _doubles(noise.thinning)],
-        (*_samples(problem), *given, objective),
-    )
+    sizes = rows, samples, outputs, x.shape[1], noise.scale.shape[1]
+    common = [_doubles(noise.scale), _doubles(noise.thinning)]
+    call(kernel, "objectives", sizes, loss.freedom, common, (*_samples(problem), *given, objective))
     return torch.from_numpy(objective)
 
 

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from retwin.inference.problem import Rows
+
 ROUNDING = 1e-12
 """Added to the unit diagonal of a precision: what outputs without noise leave open may be lost in
 the rounding of what they determine."""
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianPrior:
+class GaussianPrior(Rows):
     """A Gaussian over the latent variables of every row.
 
     Attributes
@@ -45,10 +47,6 @@ class GaussianPrior:
         """The Gaussian of independent variables, mean and variance (R, P)."""
         covariance, precision = torch.diag_embed(variance), torch.diag_embed(variance.reciprocal())
         return cls(mean, covariance, precision, -variance.log().sum(dim=1))
-
-    def __getitem__(self, rows: Tensor) -> GaussianPrior:
-        """The prior of some rows."""
-        return GaussianPrior(*(each[rows] for each in vars(self).values()))
 
     def widened(self, variance: Tensor) -> GaussianPrior:
         """The same with more variance (R, P)."""

@@ -2,14 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Protocol, Self
 
 from torch import Tensor
 
 
 @dataclass(frozen=True, eq=False)
-class CommonError:
+class Rows:
+    """A dataclass whose fields, tensors and other `Rows`, have a row for each of R problems."""
+
+    shared: ClassVar[tuple[str, ...]] = ()
+    """Fields that all rows share."""
+
+    def __getitem__(self, rows: Any) -> Self:
+        """Those of some rows."""
+        own = {each.name: getattr(self, each.name) for each in fields(self)}
+        kept = {k: v for k, v in own.items() if k not in self.shared and v is not None}
+        return replace(self, **{name: value[rows] for name, value in kept.items()})
+
+    def put(self, rows: Tensor, other: Self) -> Self:
+        """The same with those of another one in some rows."""
+        made = {}
+        for name in (each.name for each in fields(self)):
+            own, new = getattr(self, name), getattr(other, name)
+            inside = isinstance(own, Rows)
+            made[name] = own.put(rows, new) if inside else own.index_copy(0, rows, new)
+        return replace(self, **made)
+
+
+@dataclass(frozen=True, eq=False)
+class CommonError(Rows):
     """A normal error of known variance that a block of samples has in common.
 
     Attributes
@@ -23,10 +46,6 @@ class CommonError:
 
     variance: Tensor
     block: Tensor
-
-    def __getitem__(self, rows: Tensor) -> CommonError:
-        """That of some rows."""
-        return CommonError(self.variance[rows], self.block[rows])
 
 
 class Problem(Protocol):

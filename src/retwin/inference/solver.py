@@ -11,14 +11,16 @@ Comput. 4, 415, 1992).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from retwin.inference.noise import Noise
 from retwin.inference.normal import compiled_objective, compiled_step
 from retwin.inference.priors import GaussianPrior, inverse
-from retwin.inference.problem import Problem
+from retwin.inference.problem import Problem, Rows
 
 TOLERANCE = 1e-4
 """Predicted decrease of the objective, in nats, below which a row has converged."""
@@ -59,7 +61,7 @@ class Bounds:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(Rows):
     """The most probable latent variables of R rows, and the Gaussian approximation there.
 
     Attributes
@@ -91,15 +93,6 @@ class Solution:
         energy = prior.energy(x)
         return cls(x, energy, prior.precision, -energy, prior.gradient(x))
 
-    def __getitem__(self, rows: Tensor) -> Solution:
-        """The solution of some rows."""
-        return Solution(*(each[rows] for each in vars(self).values()))
-
-    def put(self, rows: Tensor, other: Solution) -> Solution:
-        """The same with another solution in some rows."""
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return Solution(*(own.index_copy(0, rows, new) for own, new in pairs))
-
     @property
     def covariance(self) -> Tensor:
         """Posterior covariance (R, P, P)."""
@@ -110,6 +103,20 @@ def blocks(covariance: Tensor, count: int) -> Tensor:
     """Covariance of each of `count` parts of x, (R, count, P / count, P / count), of (R, P, P)."""
     whole = covariance.unflatten(2, (count, -1)).unflatten(1, (count, -1))
     return whole.diagonal(dim1=1, dim2=3).movedim(-1, 1).clone()
+
+
+def best_per_row(evidence: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """The rows among `rows` (k,), each once, and the index (·,) of the best alternative of each."""
+    order = torch.as_tensor(np.lexsort((evidence.numpy(), rows.numpy())))
+    different, counts = torch.unique_consecutive(rows[order], return_counts=True)
+    return different, order[counts.cumsum(dim=0) - 1]
+
+
+def added_evidence(total: Tensor, evidence: Tensor, rows: Tensor) -> Tensor:
+    """Log sum (R,) of the evidence that each row had and of that (k,) of its alternatives."""
+    top = total.scatter_reduce(0, rows, evidence, "amax")
+    share = (total - top).exp().index_add(0, rows, (evidence - top[rows]).exp())
+    return top + share.log()
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,16 +236,8 @@ def solve(
     rows, damping = torch.arange(len(x)), torch.full_like(energy, DAMPING)
     before = torch.zeros_like(x)
     for count in range(MAX_STEPS + 1):
-        step = gauss_newton_step(
-            problem,
-            prior,
-            noise,
-            x,
-            linearised,
-            damping=damping,
-            bounds=bounds,
-            reweightings=reweightings,
-        )
+        how: Any = {"damping": damping, "bounds": bounds, "reweightings": reweightings}
+        step = gauss_newton_step(problem, prior, noise, x, linearised, **how)
         occam = 0.5 * (prior.log_determinant - step.log_determinant)
         done = (energy - step.objective < TOLERANCE) | (count == MAX_STEPS)
         if minimum_evidence is not None and count:
@@ -271,7 +270,14 @@ def solve(
         better = there <= energy
         x = torch.where(better[:, None], trial, x)
         energy = torch.where(better, there, energy)
-        linearised = _chosen(better, tried, linearised)
+        if not better.all():
+            worse = (~better).nonzero()[:, 0]
+            residual, jacobian = (
+                new.index_copy(0, worse, old[worse])
+                for new, old in zip(tried, linearised, strict=True)
+            )
+            tried = residual, jacobian
+        linearised = tried
         raised = (8 * damping).clamp(DAMPING_AFTER_FAILURE, 1e6)
         raised = torch.where(factor > 1, damping, raised)
         damping = torch.where(better, (damping / 4).clamp_min(1e-9), raised)
@@ -333,19 +339,6 @@ def _extrapolation(move: Tensor, before: Tensor, metric: Tensor) -> Tensor:
 def _left(joined: Tensor, move: Tensor) -> Tensor:
     """Residual (R, K d) of the linearised problem after a move (R, P)."""
     return (joined @ torch.cat([-move, torch.ones_like(move[:, :1])], dim=1)[..., None])[..., 0]
-
-
-def _chosen(
-    better: Tensor, new: tuple[Tensor, Tensor], old: tuple[Tensor, Tensor]
-) -> tuple[Tensor, Tensor]:
-    """Residual and Jacobian, new where a step was better."""
-    if better.all():
-        return new
-    worse = (~better).nonzero()[:, 0]
-    return (
-        new[0].index_copy(0, worse, old[0][worse]),
-        new[1].index_copy(0, worse, old[1][worse]),
-    )
 
 
 def _solved(matrix: Tensor, right: Tensor) -> Tensor:

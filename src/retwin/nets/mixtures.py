@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -75,6 +75,11 @@ class GaussianMixture(MixtureSameFamily, Block):
         weights = Categorical(logits=logits, validate_args=False)
         super().__init__(weights, components, validate_args=False)
 
+    @property
+    def parts(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The logits, means and factors of which it is made."""
+        return self.mixture_distribution.logits, self.means, self.factor
+
     def expand(
         self, batch_shape: Sequence[int], _instance: Distribution | None = None
     ) -> GaussianMixture:
@@ -82,11 +87,8 @@ class GaussianMixture(MixtureSameFamily, Block):
         shape = torch.Size(batch_shape)
         if shape == self.batch_shape:
             return self
-        return GaussianMixture(
-            self.mixture_distribution.logits.expand(*shape, -1),
-            self.means.expand(*shape, -1, -1),
-            self.factor.expand(*shape, -1, -1, -1),
-        )
+        size = len(self.batch_shape)
+        return GaussianMixture(*(each.expand(*shape, *each.shape[size:]) for each in self.parts))
 
     def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
         """A draw (..., D) as a function of noise, which gives the same draw on every device.
@@ -102,21 +104,16 @@ class GaussianMixture(MixtureSameFamily, Block):
         weights = self.mixture_distribution.probs
         cumulative = weights.cumsum(dim=-1)
         chosen = (uniform[..., None] >= cumulative).sum(dim=-1).clamp_max(weights.shape[-1] - 1)
-        size = normal.shape[-1]
-        mean = self.means.gather(-2, chosen[..., None, None].expand(*chosen.shape, 1, size))[
-            ..., 0, :
-        ]
-        factor = self.factor.gather(
-            -3, chosen[..., None, None, None].expand(*chosen.shape, 1, size, size)
-        )[..., 0, :, :]
+        place = chosen[..., None, None]
+        mean = torch.take_along_dim(self.means, place, -2)[..., 0, :]
+        factor = torch.take_along_dim(self.factor, place[..., None], -3)[..., 0, :, :]
         return mean + (factor @ normal[..., None])[..., 0]
 
     def widened(self, factor: Tensor) -> GaussianMixture:
         """The same with all deviations from the mean multiplied by `factor` (..., D)."""
         middle, factor = self.mean[..., None, :], factor[..., None, :]
         means = middle + factor * (self.means - middle)
-        logits = self.mixture_distribution.logits
-        return GaussianMixture(logits, means, factor[..., None] * self.factor)
+        return GaussianMixture(self.parts[0], means, factor[..., None] * self.factor)
 
     def marginal_cdf(self, value: Tensor) -> Tensor:
         """The marginal probabilities P(z_d <= value_d), (..., D): the PIT of `value`."""
@@ -194,9 +191,8 @@ class Blocks(Block):
     def __init__(self, blocks: Sequence[Block]) -> None:
         self.blocks = list(blocks)
         self.widths = [block.event_shape[0] for block in self.blocks]
-        super().__init__(
-            self.blocks[0].batch_shape, torch.Size([sum(self.widths)]), validate_args=False
-        )
+        width = torch.Size([sum(self.widths)])
+        super().__init__(self.blocks[0].batch_shape, width, validate_args=False)
 
     @property
     def mean(self) -> Tensor:
@@ -210,10 +206,7 @@ class Blocks(Block):
 
     def block_log_prob(self, value: Tensor) -> Tensor:
         """Log density of each block at its part of `value` (..., D), (..., blocks)."""
-        parts = value.split(self.widths, dim=-1)
-        return torch.stack(
-            [block.log_prob(part) for block, part in zip(self.blocks, parts, strict=True)], dim=-1
-        )
+        return torch.stack([block.log_prob(part) for block, part in self._split(value)], dim=-1)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density (...) at `value` (..., D)."""
@@ -236,15 +229,15 @@ class Blocks(Block):
 
     def normal_scores(self, value: Tensor) -> Tensor:
         """The quantiles (..., D) of the standard normal at the PIT of `value` (..., D)."""
-        parts = value.split(self.widths, dim=-1)
-        return torch.cat(
-            [block.normal_scores(part) for block, part in zip(self.blocks, parts, strict=True)], -1
-        )
+        return torch.cat([block.normal_scores(part) for block, part in self._split(value)], dim=-1)
 
     def widened(self, factor: Tensor) -> Blocks:
         """The same with all deviations from the mean multiplied by `factor` (D,), but of events."""
-        parts = factor.split(self.widths)
-        return Blocks([block.widened(part) for block, part in zip(self.blocks, parts, strict=True)])
+        return Blocks([block.widened(part) for block, part in self._split(factor)])
+
+    def _split(self, value: Tensor) -> Iterator[tuple[Block, Tensor]]:
+        """Each block, with its part of `value` (..., D)."""
+        return zip(self.blocks, value.split(self.widths, dim=-1), strict=True)
 
 
 class MixtureHead(nn.Module):

@@ -8,6 +8,7 @@ training that suits them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar, Protocol, runtime_checkable
@@ -16,20 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from retwin.nets.state_space import StateSpace
 from retwin.nets.training import Training
-
-__all__ = [
-    "CNN",
-    "LSTM",
-    "MLP",
-    "TCN",
-    "LSTMClassifier",
-    "Network",
-    "Standardise",
-    "StateSpace",
-    "last_layers",
-]
 
 ROWS_PER_BLOCK = 2**22
 """Rows whose moments are computed together: their copy in double precision takes 32 MB a
@@ -149,15 +137,12 @@ class _Recurrent(nn.Module):
         self.readout = nn.Sequential(
             nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, outputs)
         )
+        self.last_layers = (self.readout[-1],)
 
     def forward(self, values: Tensor) -> Tensor:
         # The read-out has the present input too, so the memory need not represent it.
         remembered, _ = self.memory(values)
         return self.readout(torch.cat([remembered, self.direct(values)], dim=-1))
-
-    @property
-    def last_layers(self) -> tuple[nn.Module, ...]:
-        return last_layers(self.readout)
 
 
 @dataclass(frozen=True)
@@ -197,6 +182,7 @@ class _Convolutional(nn.Module):
             nn.Conv1d(config.channels, config.channels, 1) for _ in range(config.levels)
         )
         self.leave = nn.Conv1d(config.channels, outputs, 1)
+        self.last_layers = (self.leave,)
 
     def forward(self, values: Tensor) -> Tensor:
         state = self.enter(values.transpose(1, 2))
@@ -207,9 +193,64 @@ class _Convolutional(nn.Module):
             state = state + mix(functional.silu(convolution(past)))
         return self.leave(functional.silu(state)).transpose(1, 2)
 
-    @property
-    def last_layers(self) -> tuple[nn.Module, ...]:
-        return (self.leave,)
+
+@dataclass(frozen=True)
+class StateSpace:
+    """x_{t+1} = x_t + r (A x_t + B u_t + f(x_t, u_t)), y_t = C x_t + h(x_t).
+
+    f and h have one hidden layer; A, B and C are the linear part. Each state has an inverse time
+    constant r of its own. The initial state is learned and the same for every record, as the
+    twin's is.
+
+    Parameters
+    ----------
+    states : int
+        Number of states; it may exceed that of the twin.
+    hidden : int
+        Width of the hidden layers of f and h.
+    slowest : float
+        Largest initial time constant, in samples; the others are spread geometrically down to 2.
+
+    """
+
+    states: int = 6
+    hidden: int = 32
+    slowest: float = 30.0
+
+    def build(self, inputs: int, outputs: int) -> nn.Module:
+        """A causal recurrent network."""
+        return _States(inputs, outputs, self)
+
+
+class _States(nn.Module):
+    def __init__(self, inputs: int, outputs: int, config: StateSpace) -> None:
+        super().__init__()
+        states, hidden = config.states, config.hidden
+        self.start = nn.Parameter(torch.zeros(states))
+        inverse_times = torch.logspace(-math.log10(config.slowest), math.log10(0.5), states)
+        self.log_rate = nn.Parameter(inverse_times.log())
+        self.enter = nn.Linear(inputs, states + hidden)
+        self.now = nn.Linear(states, states + hidden, bias=False)
+        self.move = nn.Linear(hidden, states, bias=False)
+        self.readout = nn.Sequential(
+            nn.Linear(states, hidden), nn.SiLU(), nn.Linear(hidden, outputs)
+        )
+        self.skip = nn.Linear(states, outputs, bias=False)
+        self.last_layers = (self.readout[-1], self.skip)
+        with torch.no_grad():
+            self.now.weight[:states] = -torch.eye(states)
+
+    def forward(self, values: Tensor) -> Tensor:
+        # The parameter is named `log_rate` in saved weights.
+        inverse_times, size = self.log_rate.exp(), len(self.start)
+        state = self.start.expand(len(values), -1)
+        states = []
+        for entered in self.enter(values).unbind(dim=1):
+            states.append(state)
+            linear, inside = (entered + self.now(state)).split([size, entered.shape[1] - size], 1)
+            state = state + inverse_times * (linear + self.move(torch.tanh(inside)))
+        trajectory = torch.stack(states, dim=1)
+        return self.skip(trajectory) + self.readout(trajectory)
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,7 @@ from retwin.serialisation.models import read_about, refusing, write_model
 from retwin.serialisation.sizes import Budget
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.system import System
-from retwin.twins.twin import (
-    Chunk,
-    Twin,
-    checked_commands,
-    checked_seed,
-    simulate_in_chunks,
-)
+from retwin.twins.twin import Chunk, Twin, checked_commands, checked_seed, simulate_in_chunks
 from retwin.twins.wrappers.wrapper import OfTwin
 from retwin.update.corrections import measuring
 from retwin.update.exact import ExactSurrogate, exact_surrogate, load_surrogate
@@ -112,12 +106,9 @@ class CorrectedTwin(OfTwin):
 
         @torch.no_grad()
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+            faulty = {"faulty_commands": chunk.faulty_commands, "frozen": chunk.frozen}
             context = self.residual.context(
-                self.surrogate,
-                chunk.commands,
-                chunk.segments,
-                faulty_commands=chunk.faulty_commands,
-                frozen=chunk.frozen,
+                self.surrogate, chunk.commands, chunk.segments, **faulty
             )
             if self.random:
                 sampler = self.residual.sampler(context)
@@ -131,15 +122,9 @@ class CorrectedTwin(OfTwin):
 
         with training_checked(self.surrogate, checked):
             return simulate_in_chunks(
-                self,
-                run,
-                checked,
-                faults,
-                seed=seed,
-                progress=progress,
-                emulated=self.residual.emulated,
-                threaded=isinstance(self.surrogate, Surrogate),
-            )
+                self, run, checked, faults, seed=seed, progress=progress,
+                emulated=self.residual.emulated, threaded=isinstance(self.surrogate, Surrogate),
+            )  # fmt: skip
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with `surrogate` and `residual` inside; a failure leaves no folder.
@@ -217,12 +202,9 @@ def generate(
         onsets = twin.onsets
     for_commands, for_twin = np.random.SeedSequence(seed).spawn(2)
     faults = [fault for fault in case.faults.values() for _ in range(per_class)]
-    commands = case.sampler.sample(
-        len(faults), rng=np.random.default_rng(for_commands), onsets=onsets
-    )
+    rng, own = np.random.default_rng(for_commands), int(for_twin.generate_state(1)[0])
+    commands = case.sampler.sample(len(faults), rng=rng, onsets=onsets)
     commands.flags.writeable = False  # no twin changes them, so that none needs a copy
-    made = twin.simulate(
-        commands, faults=faults, seed=int(for_twin.generate_state(1)[0]), progress=progress
-    )
+    made = twin.simulate(commands, faults=faults, seed=own, progress=progress)
     # The names of the classes are the case's; a fault has none.
     return made.replace(labels=np.repeat(case.classes, per_class))

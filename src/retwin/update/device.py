@@ -188,16 +188,8 @@ class DeviceTwin:
             path = self._surrogate(faulty.gather(1, torch.minimum(time, frozen[:, None])))
         if self._residual.segmentation == "path":
             segments = Segments.from_path(nominal.cpu().numpy())
-        return Context(
-            self._surrogate,
-            commands=sent,
-            faulty_commands=faulty,
-            frozen=frozen,
-            nominal=nominal,
-            segments=cast(Segments, TensorSegments.on(self.device, segments)),
-            rate=rate,
-            corrected=path,
-        )
+        on = cast(Segments, TensorSegments.on(self.device, segments))
+        return Context(self._surrogate, sent, faulty, frozen, nominal, on, rate, path)
 
     def _measure(
         self, context: Context, faults: Sequence[Fault | None], generator: torch.Generator
@@ -258,14 +250,8 @@ def may_be_outside(trained: CommandRange, commands: Tensor, rate: float) -> bool
     window = torch.hann_window(steps + 2, periodic=False, device=some.device)[1:-1, None]
     spectra = torch.fft.rfft((some - some.mean(dim=1, keepdim=True)) * window, dim=1).abs().square()
     frequency = torch.fft.rfftfreq(steps, 1 / rate, device=some.device)[:, None]
-    limit, power, share = (
-        torch.from_numpy(each).to(some.device)
-        for each in (
-            trained.band_limit(rate / steps),
-            np.array(trained.power),
-            trained.largest_share,
-        )
-    )
+    known = trained.band_limit(rate / steps), np.array(trained.power), trained.largest_share
+    limit, power, share = (torch.from_numpy(each).to(some.device) for each in known)
     above = (spectra * (frequency > limit)).sum(dim=1)
     scale = 2 / steps / window.square().sum()
     whole = spectra.sum(dim=1) + SMALLEST_POWER * power / scale

@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from retwin import catalog
 from retwin.checks import given, require
 from retwin.data.trajectories import Trajectories
-from retwin.progress import Progress
 from retwin.serialisation.models import kind_of, read_about, refusing, save_model
 from retwin.twins.equations.saved_equations import equations_from, equations_of
 from retwin.twins.equations.state import State
@@ -26,7 +25,7 @@ from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.twins.wrappers.wrapper import OfTwin
 from retwin.update.dynamics.estimation import estimate_starts
 from retwin.update.dynamics.twin import DynamicsTwin
-from retwin.update.dynamics.unknowns import Unknowns, state_names, state_twin_of, unknowns_of
+from retwin.update.dynamics.unknowns import state_names, state_twin_of, unknowns_of
 from retwin.update.surrogate import Surrogate
 
 KIND = "twin"
@@ -57,26 +56,22 @@ class ExactSurrogate(OfTwin):
         self.twin = twin
         self._warns = differences
 
-    def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
+    def predict(self, commands: NDArray) -> NDArray:
         """The nominal outputs (n, T, d_y), float32, for commands (n, T, d_u)."""
         values = np.asarray(commands, np.float64)
         if isinstance(self.twin, DynamicsTwin):  # whose simulations have noise besides
             return self.twin.simulation.most_probable(values)[0].astype(np.float32)
-        made = self.twin.simulate(values, seed=0, progress=progress)
-        return made.nominal.astype(np.float32)
+        return self.twin.simulate(values, seed=0).nominal.astype(np.float32)
 
     @property
     def unknown_starts(self) -> bool:
         """Whether it has a state whose start is not known, which `started` infers."""
         if isinstance(self.twin, DynamicsTwin):
             return self.twin.unknown_starts
-        return bool(state_names(self.twin)) and len(self._starts.free) > 0
-
-    @property
-    def _starts(self) -> Unknowns:
-        """The starts of the states of a `StateTwin`, at its present values."""
+        if not state_names(self.twin):
+            return False
         base, _, values = state_twin_of(self.twin)  # type: ignore[arg-type]
-        return unknowns_of(base, (), values)
+        return len(unknowns_of(base, (), values).free) > 0
 
     def started(self, record: Trajectories) -> ExactSurrogate:
         """The same with the unknown starts of one record; see `DynamicsTwin.started`."""
@@ -84,7 +79,7 @@ class ExactSurrogate(OfTwin):
             return ExactSurrogate(self.twin.started(record), differences=self._warns)
         check_channels(self.twin, record, "record")
         base, _, values = state_twin_of(self.twin)  # type: ignore[arg-type]
-        unknowns = self._starts
+        unknowns = unknowns_of(base, (), values)
         starts, _ = estimate_starts(base, record, unknowns)
         names = [f"start_{base.states[i].name}" for i in unknowns.free]
         own = values | dict(zip(names, starts.tolist(), strict=True))
@@ -129,7 +124,8 @@ class ExactSurrogate(OfTwin):
             return
         about: dict[str, Any] = {}
         if state_names(self.twin):
-            about["equations"] = equations_of(with_present_values(self.twin))  # type: ignore[arg-type]
+            base, _, values = state_twin_of(self.twin)  # type: ignore[arg-type]
+            about["equations"] = equations_of(_at_values(base, values))
         else:
             expected = "a StateTwin, or a surrogate, which can be opened again"
             remedy = "fit a surrogate of it (fit_surrogate)"
@@ -181,13 +177,8 @@ def load_surrogate(folder: str | Path, twin: Twin | None = None) -> Surrogate:
     return Surrogate.load(folder)
 
 
-def with_present_values(twin: StateTwin | ParametricTwin) -> StateTwin:
-    """The equations of a twin, whose parameters and states start at its present values."""
-    base, _, values = state_twin_of(twin)
-    return _at_values(base, values)
-
-
 def _at_values(base: StateTwin, values: Mapping[str, float]) -> StateTwin:
+    """The equations of a twin, whose parameters and states start at some values."""
     return replace(
         base,
         parameters=tuple(each.with_start(values[each.name]) for each in base.parameters),

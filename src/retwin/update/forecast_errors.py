@@ -120,12 +120,7 @@ class ForecastErrors:
     @property
     def values(self) -> dict[str, Any]:
         """As JSON values; an infinite time is null."""
-        leads = [each if np.isfinite(each) else None for each in self.leads.tolist()]
-        arrays = {name: getattr(self, name).tolist() for name in (*BY_LEAD, "low", "high")}
-        longest = self.longest if np.isfinite(self.longest) else None
-        times = {"memory": self.memory, "longest": longest, "drifts": self.drifts}
-        started = None if self.started is None else self.started.tolist()
-        return {"leads": leads, **arrays, "beyond": self.beyond, **times, "started": started}
+        return {name: _to_json(each) for name, each in vars(self).items()}
 
     @classmethod
     def of(cls, values: Mapping[str, Any] | None) -> ForecastErrors | None:
@@ -148,18 +143,15 @@ class ForecastErrors:
             got=[each.shape for each in arrays.values()],
             remedy="save the model again",
         )
-        memory, beyond = float(values["memory"]), float(values["beyond"])
         # Models that were saved before have none of these.
-        longest, drifts = values.get("longest"), bool(values.get("drifts"))
-        longest = np.inf if longest is None else float(longest)
-        started = values.get("started")
+        longest, started = values.get("longest"), values.get("started")
         return cls(
             leads=leads,
-            memory=memory,
-            beyond=beyond,
-            longest=longest,
-            drifts=drifts,
+            longest=np.inf if longest is None else float(longest),
+            drifts=bool(values.get("drifts")),
             started=None if started is None else np.array(started, dtype=float),
+            memory=float(values["memory"]),
+            beyond=float(values["beyond"]),
             **arrays,
         )
 
@@ -189,6 +181,15 @@ def warn_unlike(model: object, records: Trajectories) -> None:
             OutsideTrainingWarning,
             stacklevel=3,
         )
+
+
+def _to_json(value: Any) -> Any:
+    """A field as JSON values, infinite numbers as null."""
+    if isinstance(value, np.ndarray):
+        made = value.astype(object)
+        made[~np.isfinite(value)] = None
+        return made.tolist()
+    return None if value == np.inf else value
 
 
 def value_range(values: NDArray) -> tuple[NDArray, NDArray]:

@@ -153,19 +153,14 @@ def forecasts(twin: Twin, record: Trajectories, leads: Sequence[int]) -> Forecas
     free = free_moments(twin, record.commands)[0]
     error = np.where(record.mask, record.observed - free, np.nan)
     mean, last = (np.full((len(leads), *free.shape), np.nan) for _ in range(2))
-    present = _last_measured(error)
+    steps = np.arange(error.shape[1])[:, None]
+    place = np.maximum.accumulate(np.where(np.isfinite(error), steps, 0), axis=1)
+    present = np.take_along_axis(error, place, axis=1)  # at each sample, the last that is no NaN
     for i, lead in enumerate(leads):
         if lead < free.shape[1]:
             mean[i, :, lead:] = free[:, lead:]
             last[i, :, lead:] = present[:, :-lead]
     return Forecasts(np.where(np.isfinite(last), mean, np.nan), last)
-
-
-def _last_measured(error: NDArray) -> NDArray:
-    """At each sample, the last error (n, T, d_y) that is no NaN."""
-    steps = np.arange(error.shape[1])[:, None]
-    place = np.maximum.accumulate(np.where(np.isfinite(error), steps, 0), axis=1)
-    return np.take_along_axis(error, place, axis=1)
 
 
 def _from_states(twin: DynamicsTwin, record: Trajectories, leads: Sequence[int]) -> NDArray:
@@ -251,37 +246,35 @@ def calibrate_forecasts(
         Samples ahead of the predictions.
 
     """
-    rows = []
-    for i in range(len(leads) + 1):
-        pairs = [_errors(each, i) for each in found if not each.edge]
-        rows.append([_calibrate(pairs, channel) for channel in range(len(records.outputs))])
+    inner = [each for each in found if not each.edge]
+    errors = [[_errors(each, i) for each in inner] for i in range(len(leads) + 1)]
+    channels = range(len(records.outputs))
+    rows = [[_calibrate(pairs, channel) for channel in channels] for pairs in errors]
     persistence, deviation, independent, correlation = np.moveaxis(np.array(rows), 2, 0)
     memory = float(FORGOTTEN * correlation[-1].max() / records.rate)
-    beyond = max([BEYOND, *(each.excess for each in found if not each.edge)])
+    beyond = max([BEYOND, *(each.excess for each in inner)])
     for each in found:
         if each.edge and _hold(each, deviation[-1]):
             beyond = max(beyond, each.excess)
     times = np.append(np.array(leads) / records.rate, np.inf)
-    known = [values_of(records)]
+    known, free = [values_of(records)], [each for each, _ in errors[-1]]
     # Errors are calibrated where outputs were predicted, and not only where they were measured.
-    for each in (part for part in found if not part.edge):
-        predicted = each.record.observed - _errors(each, len(leads))[0]
+    for each, error in zip(inner, free, strict=True):
         unknown = np.full(each.record.commands.shape, np.nan)
-        known.append(np.concatenate([unknown, predicted], axis=2))
+        known.append(np.concatenate([unknown, each.record.observed - error], axis=2))
     width = known[0].shape[2]
     low, high = value_range(np.concatenate([each.reshape(1, -1, width) for each in known], axis=1))
-    free = [_errors(part, len(leads))[0] for part in found if not part.edge]
     by_lead = times, persistence, deviation, independent
     longest = float(records.lengths.max() / records.rate)
     drifts = errors_drift(np.concatenate(free))
     return ForecastErrors(
-        *by_lead, memory, low, high, beyond, longest, drifts, _calibrate_started(found)
+        *by_lead, memory, low, high, beyond, longest, drifts, _calibrate_started(inner)
     )
 
 
 def _calibrate_started(found: Sequence[LeftOut]) -> NDArray | None:
     """Deviations (d_y,) of simulations from starts that records give; None where there are none."""
-    known = [(each, each.started) for each in found if each.started is not None and not each.edge]
+    known = [(each, each.started) for each in found if each.started is not None]
     if not known:
         return None
     errors = [_errors(replace(each, free=mean), len(each.ahead.mean)) for each, mean in known]

@@ -44,18 +44,13 @@ def load_twin(folder: str | Path, twin: Twin | None = None) -> CorrectedTwin | D
     from retwin.update.dynamics import DynamicsTwin
 
     kind = kind_of(folder)
-    if kind not in (DynamicsTwin.kind, "corrected"):
-        got = f"a {kind}" if kind else "none"
-        remedy = "give the folder that fit wrote"
-        if (Path(folder) / IDENTIFICATION).is_file():
-            got = "the folder of an identification"
-            remedy = f"fit its twin first: retwin fit {Path(folder) / 'updated.toml'} --real LOG"
-        raise InputError(
-            str(folder),
-            expected="the folder of a corrected model, with its model.json",
-            got=got,
-            remedy=remedy,
-        )
     if kind == DynamicsTwin.kind:
         return DynamicsTwin.load(folder)
-    return CorrectedTwin.load(folder, twin)
+    if kind == "corrected":
+        return CorrectedTwin.load(folder, twin)
+    got, remedy = f"a {kind}" if kind else "none", "give the folder that fit wrote"
+    if (Path(folder) / IDENTIFICATION).is_file():
+        got = "the folder of an identification"
+        remedy = f"fit its twin first: retwin fit {Path(folder) / 'updated.toml'} --real LOG"
+    expected = "the folder of a corrected model, with its model.json"
+    raise InputError(str(folder), expected=expected, got=got, remedy=remedy)

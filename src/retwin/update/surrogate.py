@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,8 @@ class Surrogate(nn.Module):
 
     Attributes
     ----------
+    memoryless : bool
+        Whether an output depends on the command at the same sample only.
     fitted : Fit or None
         Record of the training; None before it.
     trained : CommandRange or None
@@ -87,13 +89,9 @@ class Surrogate(nn.Module):
         self.before = Standardise(len(inputs))
         self.after = Standardise(len(outputs))
         self.network = network.build(len(inputs), len(outputs))
+        self.memoryless = isinstance(network, MLP)
         self.fitted: Fit | None = None
         self.trained: CommandRange | None = None
-
-    @property
-    def memoryless(self) -> bool:
-        """Whether an output depends on the command at the same sample only."""
-        return isinstance(self.config, MLP)
 
     @property
     def held_out_variance(self) -> Tensor:
@@ -115,29 +113,27 @@ class Surrogate(nn.Module):
         """The outputs (n, T, d_y) for commands (n, T, d_u), both in physical units."""
         return self.after.inverse(self.network(self.before(commands)))
 
-    def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
+    def predict(self, commands: NDArray) -> NDArray:
         """The outputs (n, T, d_y), float32, for commands (n, T, d_u), without gradient.
 
         A network without memory is evaluated once for a constant command, and at a few points of a
         ramp (`evaluate_piecewise_linear`), which agrees with `forward` up to rounding.
         """
         with training_checked(self, commands):
-            return self._predict(commands, progress)
+            return self._predict(commands)
 
     @torch.no_grad()
-    def _predict(self, commands: NDArray, progress: Progress | None = None) -> NDArray:
+    def _predict(self, commands: NDArray) -> NDArray:
         """As `predict`, without a check of the commands."""
         values = np.ascontiguousarray(commands, dtype=np.float32)
         out = np.empty((*values.shape[:2], len(self.outputs)), dtype=np.float32)
+        evaluate: Callable[[Tensor], Tensor] = self
+        size = TRAJECTORIES_PER_BATCH
         if self.memoryless:
             evaluate, size = self._piecewise_linear, 1 + SAMPLES_PER_BLOCK // (1 + values.shape[1])
-        else:
-            evaluate, size = self, TRAJECTORIES_PER_BATCH
         for begin in range(0, len(values), size):
             part = slice(begin, begin + size)
             out[part] = evaluate(torch.tensor(values[part])).numpy()
-            if progress is not None:
-                progress(min(1.0, (begin + size) / len(values)))
         return out
 
     def _piecewise_linear(self, commands: Tensor) -> Tensor:
@@ -192,12 +188,9 @@ class Surrogate(nn.Module):
         about, weights = read_model(folder, "surrogate")
         with refusing(folder, expected="a surrogate model"):
             sample_rate("rate", about["rate"])
-            surrogate = cls(
-                from_config(about["network"], classes(NETWORKS)),
-                inputs=Channels.of(about["inputs"]),
-                outputs=Channels.of(about["outputs"]),
-                rate=about["rate"],
-            )
+            network = from_config(about["network"], classes(NETWORKS))
+            channels = {name: Channels.of(about[name]) for name in ("inputs", "outputs")}
+            surrogate = cls(network, **channels, rate=about["rate"])
             surrogate.load_state_dict(weights)
             surrogate.fitted = Fit.of(about["fitted"])
             if about["trained"] is not None:
@@ -276,15 +269,8 @@ def fit_surrogate(
         squares = error.square().mean(dim=-1)
         return (squares * valid_samples).sum() / valid_samples.sum()
 
-    result = train(
-        surrogate,
-        loss,
-        training_set,
-        examples(twin, valid, seed + 1),
-        training or surrogate_training(network),
-        seed=seed,
-        progress=progress,
-    )
+    how, held_out = training or surrogate_training(network), examples(twin, valid, seed + 1)
+    result = train(surrogate, loss, training_set, held_out, how, seed=seed, progress=progress)
     _hold_constant(surrogate, nominal[valid_samples])
     surrogate.trained = CommandRange.of(twin.commands, twin.rate)
     surrogate.fitted = replace(result, figures=_errors(surrogate, twin, test))

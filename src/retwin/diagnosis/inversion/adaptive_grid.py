@@ -137,10 +137,8 @@ def integrate(
         best = cells[np.argmax(mass)]
         # The likelihood may end abruptly, so that a maximum lies at the edge of a poor cell.
         beside = ((cells[..., 0] <= best[:, 1]) & (cells[..., 1] >= best[:, 0])).all(axis=1)
-        lowest = min(
-            np.sort(mass)[-min(refinement.min_refined, len(mass))],
-            mass.max() - refinement.negligible,
-        )
+        fewest = np.sort(mass)[-min(refinement.min_refined, len(mass))]
+        lowest = min(fewest, mass.max() - refinement.negligible)
         order = np.argsort(np.where(beside, -np.inf, -mass))
         wanted = beside | ((mass >= lowest) & np.isfinite(mass))
         chosen = order[: min(int(wanted.sum()), refinement.max_refined)]
@@ -150,9 +148,8 @@ def integrate(
         cells = np.concatenate([np.delete(cells, chosen, axis=0), parts])
         mass = np.concatenate([np.delete(mass, chosen), log_mass(parts)])
         before, total = total, _total(mass)
-        if abs(total - before) < refinement.tolerance and mass.max() < total + np.log(
-            refinement.max_cell_share
-        ):
+        small = mass.max() < total + np.log(refinement.max_cell_share)
+        if small and abs(total - before) < refinement.tolerance:
             break
     if not np.isfinite(total):
         return Integral(-np.inf, *[np.full(len(limits), np.nan)] * 4)
@@ -194,7 +191,6 @@ def _summary(weight: NDArray, ends: NDArray, coverage: float) -> tuple[float, fl
     change = np.bincount(first, density, len(edges)) - np.bincount(last, density, len(edges))
     # The distribution function at each edge.
     below = np.append(0.0, np.cumsum(np.cumsum(change)[:-1] * np.diff(edges)))
-    low, high = (
-        float(np.interp(level, below, edges)) for level in ((1 - coverage) / 2, (1 + coverage) / 2)
-    )
+    levels = (1 - coverage) / 2, (1 + coverage) / 2
+    low, high = np.interp(levels, below, edges).tolist()
     return low, mean, high

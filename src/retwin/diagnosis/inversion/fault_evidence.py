@@ -47,7 +47,6 @@ ROWS = 256
 NOTHING = np.full(3, np.nan)
 """The size, onset and end of no fault."""
 
-_Noise = NoiseVariances
 _Hypothesis = tuple[TimedFault | None, NDArray]
 """A fault with its size, onset and end, (3,), in samples."""
 
@@ -111,13 +110,9 @@ class FaultEvidence:
 
         whole = np.array([False, True, True])
         found = integrate(log_likelihood, limits, whole, coverage, effect=0)
-        missing = np.array(
-            [not isinstance(fault, SizedFault), False, fault.end is None], dtype=bool
-        )
-        scale = np.array([1.0, rate, rate])
-        low, mean, high = (
-            np.where(missing, np.nan, e / scale) for e in (found.low, found.mean, found.high)
-        )
+        missing = np.array([not isinstance(fault, SizedFault), False, fault.end is None])
+        scale = np.where(missing, np.nan, [1.0, rate, rate])
+        low, mean, high = (each / scale for each in (found.low, found.mean, found.high))
         if not missing[0] and np.isfinite(found.evidence):
             more = np.sqrt(self.dispersion(fault, found.best))
             low[0] = max(sizes[0], mean[0] - more * (mean[0] - low[0]))
@@ -142,9 +137,8 @@ class FaultEvidence:
         by_parameters = np.where(seen[0, ..., None], self._by_parameters, 0.0)
         slopes = np.linalg.solve(factor[0], by_parameters).reshape(errors.size, -1)
         curvature = slopes.T @ slopes + np.eye(slopes.shape[1])
-        errors = errors - (slopes @ np.linalg.solve(curvature, slopes.T @ errors.ravel())).reshape(
-            errors.shape
-        )
+        explained = slopes @ np.linalg.solve(curvature, slopes.T @ errors.ravel())
+        errors = errors - explained.reshape(errors.shape)
         variance = np.sum(errors**2) / seen.sum()
         return float(max(1.0, variance * correlation_time(errors)))
 
@@ -179,7 +173,7 @@ class FaultEvidence:
         made = [evidence + self._gains(points, noise) for noise in self._noises()] if pairs else []
         return float(logsumexp(made) - np.log(np.size(made))) if pairs else -np.inf
 
-    def _gains(self, points: Sequence[_Hypothesis], noise: _Noise) -> NDArray:
+    def _gains(self, points: Sequence[_Hypothesis], noise: NoiseVariances) -> NDArray:
         """By how much more noise, with the slopes of its filter, raises log densities (J,)."""
         slopes, own = self._slopes(noise), [self._inputs(fault, p[None])[0] for fault, p in points]
         more = np.array([self.record.log_density(each, slopes, noise)[0] for each in own])
@@ -199,13 +193,13 @@ class FaultEvidence:
         both = (steps[active], (measured[0] - record.measured)[active])
         return tuple(np.sqrt(np.mean(each**2, axis=0)) for each in both)
 
-    def _noises(self) -> list[_Noise]:
+    def _noises(self) -> list[NoiseVariances]:
         """Variances that are added to those of process or measurement noise."""
         twin = self.twin
         step = twin.domain.speed if twin.equations.step else twin.domain.speed / twin.rate
         columns = zip(self.record.measured.T, self.record.seen.T, strict=True)
         usual = np.array([own[seen].std() if seen.any() else 0.0 for own, seen in columns])
-        more: list[_Noise] = [((level * step) ** 2, 0.0) for level in LEVELS]
+        more: list[NoiseVariances] = [((level * step) ** 2, 0.0) for level in LEVELS]
         return more + [(0.0, (level * usual) ** 2) for level in LEVELS]
 
     def _under(self, fault: TimedFault | None, points: NDArray) -> NDArray:
@@ -223,9 +217,8 @@ class FaultEvidence:
         match fault:
             case ParameterFault(parameter=name):
                 change = fault.profiles(active, size, onset, self.twin.rate)
-                return Variants(
-                    change=change, parameter=self.twin.equations.names.index(name)
-                ), none
+                place = self.twin.equations.names.index(name)
+                return Variants(change=change, parameter=place), none
             case ActuatorGain(actuator=place):
                 commands = np.tile(record.commands, (len(points), 1, 1))
                 commands[..., place] *= 1 + fault.profiles(active, size, onset, self.twin.rate)
@@ -264,7 +257,7 @@ class FaultEvidence:
         """Those of the twin with its own noise."""
         return self._slopes((0.0, 0.0))
 
-    def _slopes(self, more: _Noise) -> NDArray:
+    def _slopes(self, more: NoiseVariances) -> NDArray:
         """Derivatives (T, d_y, r) of predictions by the parameters, along r directions."""
         record = self.record
         given = (each[None] for each in (record.commands, record.measured, record.seen))
@@ -290,5 +283,4 @@ def _active(points: NDArray, steps: int) -> NDArray:
     """Whether faults with the onsets and ends of points (J, 3), in samples, act: (J, T) bool."""
     onset, end = points[:, 1:2], points[:, 2:]
     index = np.arange(steps)
-    made: NDArray = (index >= onset) & (index < np.maximum(end, onset + 1))
-    return made
+    return np.asarray((index >= onset) & (index < np.maximum(end, onset + 1)))

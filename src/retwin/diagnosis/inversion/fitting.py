@@ -160,9 +160,9 @@ def _fit(
     given = DiagnosisInputs.of(surrogate, residual, healthy)
     segments = given.context.segments
     found = surrogate_variance(surrogate, twin, healthy.commands, segments)
-    variance = (
-        torch.zeros(len(residual.outputs)) if found is None else found[segments.valid].mean(0)
-    )
+    variance = torch.zeros(len(residual.outputs))
+    if found is not None:
+        variance = found[segments.valid].mean(dim=0)
     context, observed, mask = given.with_error(variance)[:]
     problem = command_problem(residual, context, observed, mask)
     noise = fitted_noise(problem, healthy_prior(residual, context), rounds=rounds)

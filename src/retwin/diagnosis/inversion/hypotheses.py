@@ -18,6 +18,7 @@ from torch import Tensor
 from retwin.checks import at_least
 from retwin.diagnosis.inversion.latent_prior import command_problem, healthy_prior
 from retwin.errors import InputError
+from retwin.inference.problem import Rows
 from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
 from retwin.update.corrections import Context
 from retwin.update.corrections.commands.missed_segments import LatentPrior
@@ -92,11 +93,6 @@ class LimitedPrior(LatentPrior):
     limit: Tensor
     healthy: Tensor
 
-    def __getitem__(self, rows: Tensor) -> LimitedPrior:
-        """The prior of some rows."""
-        gaussian, odds = self.gaussian[rows], self.odds[rows]
-        return LimitedPrior(gaussian, odds, self.limit[rows], self.healthy[rows])
-
     @property
     def deviation(self) -> Tensor:
         """Standard deviations (R, P) of x without a fault."""
@@ -109,7 +105,7 @@ class LimitedPrior(LatentPrior):
 
 
 @dataclass(frozen=True, eq=False)
-class Hypotheses:
+class Hypotheses(Rows):
     """All classes about n trajectories: row r is class r % C of trajectory r // C.
 
     Attributes
@@ -138,6 +134,7 @@ class Hypotheses:
     held_actuators: Tensor
     size: Tensor
     onsets: Tensor
+    shared = ("classes",)
 
     @classmethod
     def of(
@@ -161,32 +158,12 @@ class Hypotheses:
         made = cls(problem, prior, len(faults), actuator, held, size.double(), onsets)
         place, biased = made.offset_index, made.width > 0
         largest = torch.where(biased, made.size[:, 1], torch.inf)
-        extra, limit = (
-            torch.full_like(prior.gaussian.mean, rest).scatter(
-                1, place, own[:, None].expand(place.shape)
-            )
-            for rest, own in ((0.0, made.width.square()), (torch.inf, largest))
-        )
+        none = torch.zeros_like(prior.gaussian.mean)
+        extra = none.scatter(1, place, made.width.square()[:, None].expand_as(place))
+        limit = (none + torch.inf).scatter(1, place, largest[:, None].expand_as(place))
         wide = prior.gaussian.widened(extra)
         limited = LimitedPrior(wide, prior.odds, limit, prior.gaussian.deviation)
         return replace(made, prior=limited).held(onsets[:, 0])
-
-    def __getitem__(self, rows: Tensor) -> Hypotheses:
-        """Some of the rows."""
-        parts = (
-            each[rows] for each in (self.actuator, self.held_actuators, self.size, self.onsets)
-        )
-        return Hypotheses(self.problem[rows], self.prior[rows], self.classes, *parts)
-
-    @property
-    def trajectory(self) -> Tensor:
-        """The trajectory of each row (R,)."""
-        return torch.arange(len(self.actuator)) // self.classes
-
-    @property
-    def stuck(self) -> Tensor:
-        """Whether the row's actuator is stuck (R,) bool."""
-        return self.onsets[:, 0] < self.problem.reference.shape[1]
 
     @property
     def width(self) -> Tensor:

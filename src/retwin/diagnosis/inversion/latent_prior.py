@@ -98,13 +98,9 @@ def _covariance(distribution: Any) -> Tensor:
     shape, (size,) = distribution.batch_shape, distribution.event_shape
     generator = torch.Generator().manual_seed(0)
     # The same noise for every segment: the prior of one does not depend on the others.
-    uniform, normal = (
-        each.reshape(DRAWS, *[1] * len(shape), -1).expand(DRAWS, *shape, -1)
-        for each in (
-            torch.rand(DRAWS, generator=generator),
-            torch.randn(DRAWS, size, generator=generator),
-        )
-    )
+    noise = torch.rand(DRAWS, generator=generator), torch.randn(DRAWS, size, generator=generator)
+    rows = (each.reshape(DRAWS, *[1] * len(shape), -1) for each in noise)
+    uniform, normal = (each.expand(DRAWS, *shape, -1) for each in rows)
     drawn = distribution.expand((DRAWS, *shape)).from_noise(uniform[..., 0], normal).double()
     away = drawn - drawn.mean(dim=0)
     return torch.einsum("k...i,k...j->...ij", away, away) / (DRAWS - 1)

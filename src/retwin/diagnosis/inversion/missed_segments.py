@@ -6,12 +6,12 @@ trade time for accuracy.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import cast
 
 import torch
 from torch import Tensor
 
-from retwin.inference.em import expectation_maximisation
 from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise, predicted_variance
 from retwin.update.corrections.commands.missed_segments import (
@@ -37,42 +37,29 @@ def best_fit(
     are tried as missed by every actuator that was to move. Rows that cannot come near the best of
     their trajectory are left alone.
     """
-
-    def suspects(fit: CommandFit, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return _suspects(problem, fit, prior, noise, trajectory, rows)
-
+    suspects = partial(_suspects, problem, prior, noise, trajectory)
     return searched(problem, prior, noise, CommandFit.of_prior(problem, prior, start), suspects)
 
 
 def fitted_noise(problem: CommandProblem, prior: LatentPrior, *, rounds: int) -> Noise:
     """The noise of healthy trajectories, by so many rounds of expectation-maximisation."""
-    start = prior.gaussian.mean
-    trajectory = torch.arange(len(start))
-
-    def infer(fit: CommandFit, noise: Noise) -> CommandFit:
-        return best_fit(problem, prior, noise, fit.x, trajectory).fit
-
-    def learn(fit: CommandFit, noise: Noise) -> Noise:
-        residual, jacobian = problem.with_missed(fit.missed).linearised(fit.x)
+    x = prior.gaussian.mean
+    noise = Noise.from_median(problem, problem.residual(x), groups=2)
+    for _ in range(rounds):
+        fit = best_fit(problem, prior, noise, x, torch.arange(len(x))).fit
+        x = fit.x
+        residual, jacobian = problem.with_missed(fit.missed).linearised(x)
         variance = predicted_variance(jacobian, fit.solution.covariance)
-        return problem.learned_noise(noise, residual, variance)
-
-    _, noise = expectation_maximisation(
-        CommandFit.of_prior(problem, prior, start),
-        Noise.from_median(problem, problem.residual(start), groups=2),
-        infer=infer,
-        learn=learn,
-        rounds=rounds,
-    )
+        noise = problem.learned_noise(noise, residual, variance)
     return noise
 
 
 def _suspects(
     problem: CommandProblem,
-    fit: CommandFit,
     prior: LatentPrior,
     noise: Noise,
     trajectory: Tensor,
+    fit: CommandFit,
     rows: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Row, segment and actuator of all that is worth trying as missed."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from retwin.diagnosis.inversion.hypotheses import Hypotheses
 from retwin.inference.noise import Noise
+from retwin.inference.problem import Rows
 from retwin.inference.solver import gauss_newton_step
 from retwin.update.corrections.commands.missed_segments import fitted
 
@@ -24,7 +25,7 @@ FINE = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Onsets:
+class Onsets(Rows):
     """The posterior of the onset in each of R rows.
 
     Attributes
@@ -52,19 +53,16 @@ class Onsets:
     def of(cls, rows: Hypotheses, noise: Noise) -> Onsets:
         """Of every row; where a fault fixes the onset, there is nothing to infer."""
         first, last = rows.onsets.unbind(dim=1)
+        none = torch.zeros(len(first), dtype=torch.float64)
+        known = cls(first[:, None], torch.ones_like(none)[:, None], first, none, none)
         open_rows = (last > first).nonzero()[:, 0]
-        found = cls._infer(rows[open_rows], noise) if len(open_rows) else None
-        size = 1 if found is None else found.samples.shape[1]
-        samples = first[:, None].repeat(1, size)
+        if not len(open_rows):
+            return known
+        found = cls._infer(rows[open_rows], noise)
+        samples = first[:, None].repeat(1, found.samples.shape[1])
         probability = torch.zeros(samples.shape, dtype=torch.float64)
         probability[:, 0] = 1.0
-        best, gain = first.clone(), torch.zeros(len(first), dtype=torch.float64)
-        information = torch.zeros_like(gain)
-        if found is not None:
-            samples[open_rows], probability[open_rows] = found.samples, found.probability
-            best[open_rows], gain[open_rows] = found.best, found.gain
-            information[open_rows] = found.information
-        return cls(samples, probability, best, gain, information)
+        return cls(samples, probability, first, none, none).put(open_rows, found)
 
     @classmethod
     def _infer(cls, rows: Hypotheses, noise: Noise) -> Onsets:
@@ -80,9 +78,8 @@ class Onsets:
         at = evidence.unflatten(0, shape).argmax(dim=1, keepdim=True)
         own = evidence.unflatten(0, shape).gather(1, at)[:, 0]
         best = best.unflatten(0, shape).gather(1, at)[:, 0]
-        samples, weight, prior = (
-            each.unflatten(0, shape).flatten(1) for each in (samples, weight, prior)
-        )
+        columns = (samples, weight, prior)
+        samples, weight, prior = (each.unflatten(0, shape).flatten(1) for each in columns)
         probability = weight.softmax(dim=1)
         information = torch.special.xlogy(probability, probability / prior).sum(dim=1)
         return cls(samples, probability, best, weight.logsumexp(dim=1) - own, information)

@@ -50,11 +50,8 @@ class DiagnosisInputs:
         observed = torch.as_tensor(trajectories.observed.astype(np.float64))
         mask = torch.as_tensor(trajectories.mask.copy())
         # One by one: the timing of a trajectory's samples must not depend on the others.
-        one_by_one = [slice(i, i + 1) for i in range(len(mask))]
-        sampled = [
-            sample_mask(residual.correction, observed[i], mask[i], trajectories.rate)
-            for i in one_by_one
-        ]
+        rate, pairs = trajectories.rate, zip(observed.split(1), mask.split(1), strict=True)
+        sampled = [sample_mask(residual.correction, *each, rate) for each in pairs]
         if isinstance(surrogate, nn.Module):
             context = replace(context, surrogate=Precise(surrogate))
         return cls(context, observed, torch.cat(sampled))

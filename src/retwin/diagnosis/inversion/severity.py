@@ -134,15 +134,17 @@ class BiasDraws:
     def summary(self, coverage: float) -> Tensor:
         """Mean, and the ends of the central interval of that coverage, (R, M, 3)."""
         order = self.values.argsort(dim=1)
-        sorted_values = self.values.gather(1, order)
         weights = self.weights[..., None].expand_as(self.values).gather(1, order)
-        below = weights.cumsum(dim=1)
-        mean = (weights * sorted_values).sum(dim=1)
-        ends = [
-            sorted_values.gather(1, (below < level).sum(dim=1, keepdim=True).clamp_max(POINTS - 1))
-            for level in ((1 - coverage) / 2, (1 + coverage) / 2)
-        ]
-        return torch.stack([mean, *(end[:, 0] for end in ends)], dim=-1)
+        return central_interval(self.values.gather(1, order), weights, coverage)
+
+
+def central_interval(values: Tensor, weights: Tensor, coverage: float) -> Tensor:
+    """Mean and ends (R, ..., 3) of sorted values (R, K, ...) with weights that sum to one."""
+    below, last = weights.cumsum(dim=1), values.shape[1] - 1
+    levels = ((1 - coverage) / 2, (1 + coverage) / 2)
+    places = [(below < level).sum(dim=1, keepdim=True).clamp_max(last) for level in levels]
+    ends = (values.gather(1, place)[:, 0] for place in places)
+    return torch.stack([(weights * values).sum(dim=1), *ends], dim=-1)
 
 
 def draw_biases(mean: Tensor, covariance: Tensor, *, width: Tensor, size: Tensor) -> BiasDraws:
@@ -177,9 +179,8 @@ def draw_biases(mean: Tensor, covariance: Tensor, *, width: Tensor, size: Tensor
         values[..., m] = centre + scale * noise[..., m]
         log_mass = log_mass + mass.log()
     density = -torch.log(2 * (high - low))[:, None, None]
-    normal = -0.5 * (values / width[:, None, None]).square() - torch.log(
-        width[:, None, None] * (2 * torch.pi) ** 0.5
-    )
+    wide = width[:, None, None]
+    normal = -0.5 * (values / wide).square() - torch.log(wide * (2 * torch.pi) ** 0.5)
     log_weight = log_mass + (density - normal).sum(dim=-1)
     gain = log_weight.logsumexp(dim=1) - torch.log(torch.tensor(float(POINTS)))
     weights = log_weight.softmax(dim=1)
@@ -195,11 +196,9 @@ def _inside(
 ) -> tuple[Tensor, Tensor]:
     """Standard normal draws for which |centre + scale z| is between the limits, and that mass."""
     ndtr, ndtri = torch.special.ndtr, torch.special.ndtri
-    ends = [((low - centre) / scale, (high - centre) / scale)]
-    ends.append(((-high - centre) / scale, (-low - centre) / scale))
-    masses, draws = [], []
-    shares = []
-    for begin, end in ends:
+    masses, draws, shares = [], [], []
+    for first, last in ((low, high), (-high, -low)):
+        begin, end = (first - centre) / scale, (last - centre) / scale
         # The upper tail is turned over: far out, only the lower one has digits left.
         upper = begin > 0
         left, right = torch.where(upper, -end, begin), torch.where(upper, -begin, end)

@@ -21,7 +21,7 @@ from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.estimate import Estimate, ImplausibleError
 from retwin.diagnosis.inversion.adaptive_grid import Integral
 from retwin.diagnosis.inversion.fault_evidence import NOTHING, FaultEvidence
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults.actuator_faults import Fault
@@ -29,8 +29,6 @@ from retwin.twins.faults.system_faults import FAULTS, TimedFault, check_faults
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics import DynamicsTwin
 from retwin.workers.threads import in_threads
-
-__all__ = ["StateDiagnosis", "StateInversionDiagnoser"]
 
 UNEXPLAINED = "larger noise than in calibration explains the outputs better than every class"
 """The reason for which a trajectory is unknown."""
@@ -74,9 +72,7 @@ class StateDiagnosis:
     @property
     def labels(self) -> NDArray:
         """The most probable class of each trajectory (n,), or "unknown"."""
-        names = np.array([*self.classes, UNKNOWN])
-        made: NDArray = names[self.evidence.argmax(axis=1)]
-        return made
+        return np.array([*self.classes, UNKNOWN])[self.evidence.argmax(axis=1)]
 
     @property
     def reason(self) -> NDArray:
@@ -94,6 +90,11 @@ class StateInversionDiagnoser:
     faults : mapping of str to Fault or None
         Class name to fault, None for healthy, in the order of the probabilities. What a fault
         leaves open, as a pair (low, high), is inferred.
+
+    Attributes
+    ----------
+    classes : tuple of str
+        Class names, in the order of the probabilities.
 
     Raises
     ------
@@ -120,14 +121,8 @@ class StateInversionDiagnoser:
             )
         check_faults(list(faults.values()), len(twin.inputs), len(twin.outputs), twin.shiftable)
         self.twin = twin
-        self.faults = {
-            name: each if isinstance(each, TimedFault) else None for name, each in faults.items()
-        }
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Class names, in the order of the probabilities."""
-        return tuple(self.faults)
+        self.classes = tuple(faults)
+        self.faults: dict[str, TimedFault | None] = dict(faults)  # type: ignore[arg-type]
 
     def with_faults(self, more: Mapping[str, Fault | None]) -> StateInversionDiagnoser:
         """The same with further classes."""
@@ -170,21 +165,12 @@ class StateInversionDiagnoser:
 
         """
         check_channels(self.twin, trajectories, "trajectories")
-        empty = trajectories.ids[~trajectories.mask.any(axis=(1, 2))].tolist()
-        remedy = "leave them out"
-        nothing(
-            "trajectories",
-            map("none in {}".format, empty),
-            "measured samples in each",
-            remedy=remedy,
-        )
-        found, dispersions = [], []
+        empty = trajectories.ids[~trajectories.mask.any(axis=(1, 2))]
+        none = (f"none in {each}" for each in empty)
+        nothing("trajectories", none, "measured samples in each", remedy="leave them out")
         single = [trajectories[i : i + 1] for i in range(len(trajectories))]
-        for row, dispersion in in_threads(lambda each: self._integrals(each, known_start), single):
-            found.append(row)
-            dispersions.append(dispersion)
-            if progress is not None:
-                progress(len(found) / len(trajectories))
+        rows = in_threads(lambda each: self._integrals(each, known_start), single)
+        found, dispersions = zip(*tracked(rows, len(single), progress), strict=True)
         evidence = np.array([[each.evidence for each in row] for row in found])
         if not np.isfinite(evidence).any(axis=1).all():
             raise ImplausibleError(
@@ -245,10 +231,7 @@ class StateInversionDiagnoser:
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with the twin inside, or nothing."""
-        faults = [
-            [name, None if fault is None else to_config(fault, FAULTS)]
-            for name, fault in self.faults.items()
-        ]
+        faults = [[name, each and to_config(each, FAULTS)] for name, each in self.faults.items()]
         with write_model(folder, "state inversion", {"faults": faults}, {}) as inside:
             self.twin.save(inside / "twin")
 
@@ -257,8 +240,5 @@ class StateInversionDiagnoser:
         """Read what `save` wrote; InputError when it is no such inversion or damaged."""
         about, _ = read_model(folder, "state inversion")
         twin = DynamicsTwin.load(Path(folder) / "twin")
-        faults = {
-            name: None if config is None else from_config(config, FAULTS)
-            for name, config in about["faults"]
-        }
+        faults = {name: each and from_config(each, FAULTS) for name, each in about["faults"]}
         return cls(twin, faults)

@@ -8,6 +8,7 @@ explain them best give the severity of the fault.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +29,9 @@ from retwin.diagnosis.inversion.latent_prior import command_space
 from retwin.diagnosis.inversion.missed_segments import best_fit
 from retwin.diagnosis.inversion.onsets import Onsets
 from retwin.diagnosis.inversion.samples import DiagnosisInputs
-from retwin.diagnosis.inversion.severity import biases, stuck_level
+from retwin.diagnosis.inversion.severity import biases, central_interval, stuck_level
 from retwin.inference.noise import Noise
-from retwin.progress import Progress
+from retwin.progress import Progress, tracked
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
@@ -144,7 +145,8 @@ def invert(rows: Hypotheses, noise: Noise) -> Inversion:
     """The evidence for every hypothesis, and the severity of its fault."""
     onsets = Onsets.of(rows, noise)
     held = rows.held(onsets.best)
-    found = best_fit(held.problem, held.prior, noise, held.start, held.trajectory)
+    trajectory = torch.arange(len(held.actuator)) // held.classes
+    found = best_fit(held.problem, held.prior, noise, held.start, trajectory)
     fit = found.fit
     # What is beyond the limits of a bias counted in the search; `biases` integrates over them.
     evidence = found.evidence + held.prior.excess(fit.x).sum(dim=1)
@@ -214,15 +216,9 @@ class InversionDiagnoser:
 
     def with_faults(self, more: Mapping[str, Fault | None]) -> InversionDiagnoser:
         """The same with further classes."""
-        return InversionDiagnoser(
-            self.surrogate,
-            self.residual,
-            {**self.faults, **more},
-            noise=self.noise,
-            surrogate_variance=self.surrogate_variance,
-            bound=self.bound,
-            calibration=self.calibration,
-        )
+        made = copy.copy(self)
+        made.faults = checked({**self.faults, **more})
+        return made
 
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes), see `Diagnoser`."""
@@ -262,22 +258,17 @@ class InversionDiagnoser:
         faults = (*self.faults.values(), *pairs.values())
         parts = []
         healthy = faults.index(None) if None in faults else -1
-        for begin in range(0, len(trajectories), TRAJECTORIES_PER_BATCH):
+        begins = range(0, len(trajectories), TRAJECTORIES_PER_BATCH)
+        for begin in tracked(begins, len(begins), progress):
             part = given[begin : begin + TRAJECTORIES_PER_BATCH]
             rows = Hypotheses.of(faults, self.residual, *part)
             found = invert(rows, self.noise)
             offset = _offsets(rows, found, len(faults), healthy)
             parts.append((*_severities(rows, found, len(faults)), offset))
-            if progress is not None:
-                progress(min(1.0, (begin + TRAJECTORIES_PER_BATCH) / len(trajectories)))
-        evidence, explained, level, onset, bias, offset = (
-            np.concatenate(each) for each in zip(*parts, strict=True)
-        )
+        *by_class, offset = (np.concatenate(each) for each in zip(*parts, strict=True))
         count = len(self.classes)
-        each, named = _several(evidence, count, list(pairs))
-        evidence, explained, level, onset, bias = (
-            found[:, :count] for found in (evidence, explained, level, onset, bias)
-        )
+        each, named = _several(by_class[0], count, list(pairs))
+        evidence, explained, level, onset, bias = (found[:, :count] for found in by_class)
         share = np.exp(evidence - evidence.max(axis=1, keepdims=True))
         missing = unmeasured_outputs(trajectories, self.calibration.outputs)
         measured = given.mask.any(dim=2).sum(dim=1).clamp_min(1).numpy()
@@ -285,6 +276,7 @@ class InversionDiagnoser:
         unknown = np.where(missing == "", unknown, 1.0)
         severities = (level, onset / trajectories.rate, bias)
         levels, onsets, offsets = (Estimate(*np.moveaxis(each, -1, 0)) for each in severities)
+        doubts = [missing != "", each > 0.5, unknown > 0.5]
         return Diagnosis(
             self.classes,
             share / share.sum(axis=1, keepdims=True),
@@ -296,9 +288,7 @@ class InversionDiagnoser:
             outside_training(self.surrogate, trajectories),
             unknown,
             offset,
-            np.select(
-                [missing != "", each > 0.5, unknown > 0.5], [missing, named, UNEXPLAINED], ""
-            ),
+            np.select(doubts, [missing, named, UNEXPLAINED], ""),
             each,
         )
 
@@ -317,16 +307,10 @@ class InversionDiagnoser:
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with `surrogate` and `residual` inside, or nothing."""
-        faults = [
-            [name, None if fault is None else to_config(fault, FAULTS)]
-            for name, fault in self.faults.items()
-        ]
+        faults = [[name, each and to_config(each, FAULTS)] for name, each in self.faults.items()]
         about = {"faults": faults, "calibration": to_config(self.calibration, (Calibration,))}
-        learned = {
-            "scale": self.noise.scale,
-            "thinning": self.noise.thinning,
-            "surrogate_variance": self.surrogate_variance,
-        }
+        learned = {"scale": self.noise.scale, "thinning": self.noise.thinning}
+        learned["surrogate_variance"] = self.surrogate_variance
         if np.isfinite(self.bound):
             learned["bound"] = torch.tensor(self.bound, dtype=torch.float64)
         with write_model(folder, "inversion", about, learned) as inside:
@@ -337,12 +321,9 @@ class InversionDiagnoser:
     def load(cls, folder: str | Path) -> InversionDiagnoser:
         """Read what `save` wrote; InputError when it is not an inversion or damaged."""
         about, weights = read_model(folder, "inversion")
-        folder = Path(folder)
+        folder, calibration = Path(folder), about.get("calibration", {"kind": "Calibration"})
         surrogate = load_surrogate(folder / "surrogate")
-        faults = {
-            name: None if config is None else from_config(config, FAULTS)
-            for name, config in about["faults"]
-        }
+        faults = {name: each and from_config(each, FAULTS) for name, each in about["faults"]}
         return cls(
             surrogate,
             ResidualModel.load(folder / "residual"),
@@ -350,9 +331,7 @@ class InversionDiagnoser:
             noise=Noise(weights["scale"], weights["thinning"]),
             surrogate_variance=weights["surrogate_variance"],
             bound=float(weights.get("bound", -np.inf)),
-            calibration=from_config(about["calibration"], (Calibration,))
-            if "calibration" in about
-            else Calibration(),
+            calibration=from_config(calibration, (Calibration,)),
         )
 
 
@@ -393,17 +372,11 @@ def _severities(rows: Hypotheses, found: Inversion, classes: int) -> tuple[NDArr
     """
     half = NormalDist().inv_cdf(0.5 + COVERAGE / 2) * found.level_deviation
     level = torch.stack([found.level, found.level - half, found.level + half], dim=1)
-    samples, probability = found.onsets.samples, found.onsets.probability
-    below, last = probability.cumsum(dim=1), samples.shape[1] - 1
-    ends = [
-        samples.gather(1, (below < share).sum(dim=1, keepdim=True).clamp_max(last))
-        for share in ((1 - COVERAGE) / 2, (1 + COVERAGE) / 2)
-    ]
-    onset = torch.cat([(probability * samples).sum(dim=1, keepdim=True), *ends], dim=1)
+    onset = central_interval(found.onsets.samples, found.onsets.probability, COVERAGE)
     # An actuator lags its command by up to the delay, and only the level shows when it stopped.
     delay = rows.problem.per_segment(found.fit.x)[..., 0]
     onset = onset + delay.abs().mean(dim=1, keepdim=True) * torch.tensor([0.0, -1.0, 1.0])
-    free = ~rows.stuck[:, None]
+    free = rows.onsets[:, :1] >= rows.problem.reference.shape[1]
     level, onset = (each.masked_fill(free, torch.nan) for each in (level, onset))
     every = (found.evidence, found.evidence + found.information, level, onset, found.bias)
     return tuple(each.unflatten(0, (-1, classes)).numpy() for each in every)

@@ -97,19 +97,17 @@ class DANN:
             # From 0 to 1 over the training: an untrained critic is wrong.
             weight = 2 / (1 + math.exp(-self.gamma * next(steps) / last)) - 1
             domains = torch.cat([torch.zeros(len(source)), torch.ones(len(real))])
-            return functional.cross_entropy(
-                pair.classify(representation[: len(source)]), batch[1]
-            ) + functional.binary_cross_entropy_with_logits(
-                pair.critic(_reverse(representation, weight))[:, 0], domains
-            )
+            classes = pair.classify(representation[: len(source)])
+            critic = pair.critic(_reverse(representation, weight))[:, 0]
+            of_critic = functional.binary_cross_entropy_with_logits(critic, domains)
+            return functional.cross_entropy(classes, batch[1]) + of_critic
 
         labelled = (phases, class_index(fitted_on, order))
         result = train(pair, loss, labelled, None, how, seed=seed, progress=task.progress)
         best = diagnoser.of_features(features(held_out)).argmax(axis=1)
-        figures = {
-            "accuracy": float((best == class_index(held_out, order).numpy()).mean()),
-            "domain_accuracy": pair.domain_accuracy(features(held_out), unlabelled[:, 0]),
-        }
+        accuracy = float((best == class_index(held_out, order).numpy()).mean())
+        of_critic = pair.domain_accuracy(features(held_out), unlabelled[:, 0])
+        figures = {"accuracy": accuracy, "domain_accuracy": of_critic}
         diagnoser.fitted = replace(result, figures=figures)
         return diagnoser
 

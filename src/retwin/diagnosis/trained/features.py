@@ -159,9 +159,8 @@ class Features:
             residual = np.where(there, trajectories.observed[rows][:, time] - nominal, 0.0)
             if settled is not None:
                 hidden = (time < settled[rows, None])[:, :, None]
-                at_rest = np.take_along_axis(
-                    trajectories.nominal[rows], settled[rows, None, None], axis=1
-                )
+                place = settled[rows, None, None]
+                at_rest = np.take_along_axis(trajectories.nominal[rows], place, axis=1)
                 nominal = np.where(hidden, at_rest, nominal)
                 residual = np.where(hidden, 0.0, residual)
             found[rows] = np.concatenate([nominal, residual], axis=2)

@@ -84,8 +84,6 @@ class FineTune:
             return nn.functional.cross_entropy(module(random_phase(mixed, generator)), truth)
 
         examples = (features.phases(generated), class_index(generated, base.classes))
-        how = task.training or FINE_TUNING
-        tuned.fitted = train(
-            tuned, loss, examples, None, how, seed=task.seed, progress=task.progress
-        )
+        how, seed = task.training or FINE_TUNING, task.seed
+        tuned.fitted = train(tuned, loss, examples, None, how, seed=seed, progress=task.progress)
         return tuned

@@ -68,9 +68,8 @@ def fit_diagnoser(
         channels or another rate.
 
     """
-    instance(
-        "trajectories", trajectories, Trajectories, remedy="load recorded ones, or simulate a twin"
-    )
+    remedy = "load recorded ones, or simulate a twin"
+    instance("trajectories", trajectories, Trajectories, remedy=remedy)
     adapts = isinstance(classifier, Method) and classifier.adapts
     require(
         (target is not None) == adapts,

@@ -28,6 +28,11 @@ class PooledDiagnoser:
         Fitted diagnosers of the same classes, each in an order of its own; the pool takes the
         order of the first one.
 
+    Attributes
+    ----------
+    classes : tuple of str
+        Class names, in the order of the probabilities.
+
     Raises
     ------
     InputError
@@ -55,11 +60,7 @@ class PooledDiagnoser:
             got=[member.classes for member in self.members],
             remedy="fit all of them with the classes of one case",
         )
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Class names, in the order of the probabilities."""
-        return self.members[0].classes
+        self.classes = self.members[0].classes
 
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes), see `Diagnoser`."""

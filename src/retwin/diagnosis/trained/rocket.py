@@ -83,7 +83,7 @@ class Rocket:
         probabilities by one temperature, chosen on the held-out fifth (Guo et al., "On calibration
         of modern neural networks", ICML 2017).
         """
-        trajectories, progress = task.trajectories, task.progress
+        trajectories, report = task.trajectories, task.progress or (lambda _: None)
         require(
             task.training is None,
             "training",
@@ -105,8 +105,7 @@ class Rocket:
         learnt = before.fit(features(fitted_on))(features(fitted_on))
         transform = _minirocket(self.kernels, task.seed, _channels(learnt))
         convolved = _convolve(transform, learnt)
-        if progress is not None:
-            progress(0.4)
+        report(0.4)
         slope, level = _ridge(convolved, fitted_on.labels, order)
         scores = _convolve(transform, before(features(held_out))) @ slope.T + level
         truth = class_index(held_out, order).numpy()
@@ -118,8 +117,7 @@ class Rocket:
             "slope": torch.as_tensor(slope / temperature),
             "level": torch.as_tensor(level / temperature),
         }
-        if progress is not None:
-            progress(1.0)
+        report(1.0)
         accuracy = float((scores.argmax(1) == truth).mean())
         figures = {"accuracy": accuracy, "log_loss": log_loss}
         return RocketDiagnoser(features, order, learnt.shape[1], weights, figures)

@@ -144,7 +144,7 @@ class Candidates:
             twin,
             self.records,
             correction,
-            density,  # type: ignore[call-overload]
+            density,  # type: ignore[arg-type]
             seed=self.seed,
             calibrate_on=self.settings.calibrate_on,
             twin=self.original,

@@ -24,7 +24,7 @@ from retwin.workers.threads import one_thread
 
 __all__ = ["BLACK_BOXES", "BlackBox", "fit_black_box"]
 
-BLACK_BOXES: Mapping[str, Callable[[Trajectories, int, Progress | None], BlackBox]] = {
+BLACK_BOXES: Mapping[str, Callable[..., BlackBox]] = {
     "arx": fit_arx,
     "narx": fit_narx,
     "neural_ss": fit_neural_ss,
@@ -76,8 +76,6 @@ def fit_black_box(
     """
     began, fit = time.perf_counter(), BLACK_BOXES[one_of("kind", kind, BLACK_BOXES)]
     with np.errstate(over="ignore", invalid="ignore"):  # of models that diverge, and are not chosen
-        if fit is fit_lstm:
-            found = fit_lstm(observed, checked_seed(seed), progress, members)
-        else:
-            found = fit(observed, checked_seed(seed), progress)
+        more = {"members": members} if fit is fit_lstm else {}
+        found = fit(observed, checked_seed(seed), progress, **more)
     return replace(found, seconds=time.perf_counter() - began)

@@ -56,9 +56,8 @@ def best_linear(
 ) -> tuple[Linear, BlackBoxFit]:
     """The linear model of the best order, and its fit."""
     check_records(observed)
-    order, fit = best_order(
-        range(1, MAX_ORDER + 1), lambda n: Linear(Lags(observed, n, 1)).fit(), progress
-    )
+    orders = range(1, MAX_ORDER + 1)
+    order, fit = best_order(orders, lambda n: Linear(Lags(observed, n, 1)).fit(), progress)
     return Linear(Lags(observed, order, 1)), fit
 
 
@@ -86,10 +85,8 @@ class Linear:
         width, inputs, n = self.sizes
         begin = 1 + n * width
         by_outputs = [theta[:, 1 + i * width : 1 + (i + 1) * width] for i in range(n)]
-        by_commands = [
-            theta[:, begin + i * inputs : begin + (i + 1) * inputs] for i in range(n + 1)
-        ]
-        return theta[:, 0], by_outputs, [by_commands[n], *by_commands[:n]]
+        places = (begin + i * inputs for i in (n, *range(n)))
+        return theta[:, 0], by_outputs, [theta[:, place : place + inputs] for place in places]
 
     def twin(self, theta: NDArray) -> StateTwin:
         """The model in observer form, its parameters beginning at coefficients (d_y, k)."""
@@ -120,15 +117,9 @@ class Linear:
         bound = START * (1.0 + float(np.abs(starts).max()))
         terms = [each.name for each in self.lags.terms]
         names = [f"{own}: {term}" for own in observed.outputs.names for term in terms]
-        return StateTwin(
-            states_within(starts, bound),
-            output,
-            observed.inputs,
-            observed.outputs,
-            observed.rate,
-            step=step,
-            parameters=coefficients_of(names, theta),
-        )
+        channels = observed.inputs, observed.outputs, observed.rate
+        states, parameters = states_within(starts, bound), coefficients_of(names, theta)
+        return StateTwin(states, output, *channels, step=step, parameters=parameters)
 
     def starts(self, theta: NDArray) -> NDArray:
         """States (records, n d_y) at the first samples, as if each record had been at rest."""

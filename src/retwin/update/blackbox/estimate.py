@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
@@ -26,6 +25,7 @@ from retwin.update.dynamics.fitting import assembled
 from retwin.update.dynamics.left_out import held_out
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
+from retwin.update.forecast_errors import value_range
 
 FOLDS = 10
 """Parts of the calibration record, each made of blocks of all trajectories, that are held out."""
@@ -116,15 +116,14 @@ class BlackBoxFit:
         estimation, point = self.estimation, self.point
         steps = np.diff(estimation.simulated(point)[1], axis=1)
         speed = np.sqrt(np.mean(steps**2, axis=(0, 1)))
-        found = estimation.linearised(point)
         speed, whole = np.where(speed > 0, speed, 1.0), [np.full(estimation.seen.shape[:2], True)]
+        found = estimation.linearised(point)
         unmoved = np.zeros((1, estimation.unknowns.count))
         names = tuple(each.name for each in estimation.twin.states[:corrected])
         made = assembled(estimation, found, names, speed, whole, unmoved)
         uncertain = held_out(estimation, found, held_out_parts(estimation.seen))
-        made = replace(
-            made, widening=widening(made, self._tested, replace(uncertain, errors=self.errors))
-        )
+        factors = widening(made, self._tested, replace(uncertain, errors=self.errors))
+        made = replace(made, widening=factors)
         figures = {
             "order": float(order),
             "parameters": float(estimation.unknowns.count),
@@ -145,11 +144,8 @@ def check_records(observed: Trajectories) -> None:
 
     """
     checked_stride(observed, observed, None, "observed")  # type: ignore[arg-type]  # its channels
-    fixed = [
-        name
-        for i, name in enumerate(observed.outputs.names)
-        if np.unique(observed.observed[..., i][observed.mask[..., i]]).size < 2
-    ]
+    low, high = value_range(np.where(observed.mask, observed.observed, np.nan))
+    fixed = [name for name, same in zip(observed.outputs.names, low == high, strict=True) if same]
     require(
         not fixed and len(observed.inputs) > 0,
         "observed",
@@ -180,15 +176,11 @@ def best_order(
             progress(0.9 * done / len(orders))
         if best is not None and order - best[0] >= PATIENCE:
             break
-    if best is None:
-        raise InputError(
-            "observed",
-            expected="records by which a model of past samples can be simulated",
-            got="records with which every order diverges in free simulation, or in which too few "
-            "samples follow each other",
-            remedy="give longer records, with all outputs measured at consecutive samples",
-        )
-    return best
+    expected = "records by which a model of past samples can be simulated"
+    got = "records with which every order diverges in free simulation, or in which too few samples "
+    got += "follow each other"
+    remedy = "give longer records, with all outputs measured at consecutive samples"
+    return given("observed", best, expected, got=got, remedy=remedy)
 
 
 def held_out_parts(seen: NDArray) -> list[NDArray]:

@@ -95,10 +95,8 @@ class Lags:
     def domain(self) -> Domain:
         """Ranges of the variables."""
         y, u = self.outputs, self.commands
-        low, high, mean = (
-            np.concatenate([*[a] * self.order, *[b] * (self.order + 1)])
-            for a, b in ((y.low, u.low), (y.high, u.high), (y.mean, u.mean))
-        )
+        n, pairs = self.order, ((y.low, u.low), (y.high, u.high), (y.mean, u.mean))
+        low, high, mean = (np.concatenate([*[a] * n, *[b] * (n + 1)]) for a, b in pairs)
         return Domain(low, high, mean, np.ones(len(self.names)))
 
     @cached_property
@@ -125,10 +123,9 @@ class Lags:
         import torch
 
         n, samples = self.order, self.observed.steps
-        y, u = (
-            each.astype(np.float64) for each in (self.observed.observed, self.observed.commands)
-        )
-        whole: NDArray = np.asarray(self.observed.mask.all(axis=2))
+        pair = self.observed.observed, self.observed.commands
+        y, u = (each.astype(np.float64) for each in pair)
+        whole = np.asarray(self.observed.mask.all(axis=2))
         spans = [whole[:, n - lag : max(n, samples) - lag] for lag in range(n + 1)]
         record, sample = np.nonzero(np.all(spans, axis=0))
         sample = sample + n

@@ -38,19 +38,13 @@ def fit_levels(observed: Trajectories) -> DynamicsTwin:
     def step(x: Any, u: Any, p: Any) -> Any:
         return (x[0],)
 
+    channels, states = observed.outputs, [State("rest", "1", 0.0)]
+    parameters = [
+        Parameter(f"level of {name}", unit, -WIDEST, WIDEST, value)
+        for name, unit, value in zip(channels.names, channels.units, level.tolist(), strict=True)
+    ]
     equations = StateTwin(
-        [State("rest", "1", 0.0)],
-        output,
-        observed.inputs,
-        observed.outputs,
-        observed.rate,
-        step=step,
-        parameters=[
-            Parameter(f"level of {name}", unit, -WIDEST, WIDEST, value)
-            for name, unit, value in zip(
-                observed.outputs.names, observed.outputs.units, level.tolist(), strict=True
-            )
-        ],
+        states, output, observed.inputs, channels, observed.rate, step=step, parameters=parameters
     )
     nothing, inputs = np.zeros(1), len(observed.inputs)
     low = np.concatenate([nothing, observed.commands.min(axis=(0, 1))]) if inputs else nothing

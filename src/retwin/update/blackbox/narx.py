@@ -62,11 +62,10 @@ def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> Bl
     each explains beyond those before it. They have a Gaussian prior about 0.
     """
     check_records(observed)
-
-    def fit(order: int) -> BlackBoxFit | None:
-        return Polynomial(Lags(observed, order, DEGREE)).fit()
-
-    order, found = best_order(range(1, MAX_ORDER + 1), fit, progress)
+    orders = range(1, MAX_ORDER + 1)
+    order, found = best_order(
+        orders, lambda n: Polynomial(Lags(observed, n, DEGREE)).fit(), progress
+    )
     return found.model(order, len(observed.outputs))
 
 
@@ -93,27 +92,19 @@ class Polynomial:
 
         def output(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
             values, given = lags.values([*x, *u]), iter(p)
-            sums = [
-                sum(next(given) * values[i] for i in own).clamp(-WIDER, WIDER) for own in chosen
-            ]
-            return tuple(a + b * each for a, b, each in zip(level, height, sums, strict=True))
+            sums = (sum(next(given) * values[i] for i in own) for own in chosen)
+            held = [each.clamp(-WIDER, WIDER) for each in sums]
+            return tuple(a + b * each for a, b, each in zip(level, height, held, strict=True))
 
         def step(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
             commands = x[width + past : len(x) - inputs]
             return (*output(x, u, p), *x[:past], *u, *commands)
 
         places = [(own, i) for own, terms in enumerate(chosen) for i in terms]
-        return StateTwin(
-            self._states(),
-            output,
-            observed.inputs,
-            observed.outputs,
-            observed.rate,
-            step=step,
-            parameters=coefficients_of(
-                [f"{observed.outputs.names[own]}: {names[i]}" for own, i in places], coefficients
-            ),
-        )
+        terms = [f"{observed.outputs.names[own]}: {names[i]}" for own, i in places]
+        parameters = coefficients_of(terms, coefficients)
+        channels = observed.inputs, observed.outputs, observed.rate
+        return StateTwin(self._states(), output, *channels, step=step, parameters=parameters)
 
     @property
     def starts(self) -> NDArray:
@@ -127,12 +118,8 @@ class Polynomial:
         low, high = (each[: len(units)] for each in (lags.domain.low, lags.domain.high))
         margin = MARGIN * np.where(high > low, high - low, 1.0)
         columns = (self.starts.mean(axis=0), low - margin, high + margin)
-        return [
-            State(name, unit, *each)
-            for name, unit, *each in zip(
-                lags.names, units, *(each.tolist() for each in columns), strict=True
-            )
-        ]
+        numbers = (each.tolist() for each in columns)
+        return [State(*each) for each in zip(lags.names, units, *numbers, strict=True)]
 
     def fit(self) -> BlackBoxFit | None:
         """The model; None where samples are too few or the linear model diverges."""
@@ -143,16 +130,13 @@ class Polynomial:
         def start(part: NDArray) -> BlackBoxFit:
             kept = self.lags.rows.without(part)
             coefficients = np.zeros((len(chosen), max(map(len, chosen))))
-            coefficients[:, linear] = [
-                least_squares(kept.values[:, linear], y) for y in kept.outputs.T
-            ]
-            flat = np.concatenate(
-                [own[: len(terms)] for own, terms in zip(coefficients, chosen, strict=True)]
-            )
+            columns = kept.values[:, linear]
+            coefficients[:, linear] = [least_squares(columns, y) for y in kept.outputs.T]
+            pairs = zip(coefficients, chosen, strict=True)
+            flat = np.concatenate([own[: len(terms)] for own, terms in pairs])
             estimation = estimation_of(self.twin(chosen, flat), observed, part)
-            return BlackBoxFit(
-                self._with_prior(estimation, chosen), Point(flat, self.starts), np.empty(0)
-            )
+            estimation = self._with_prior(estimation, chosen)
+            return BlackBoxFit(estimation, Point(flat, self.starts), np.empty(0))
 
         return with_best_prior(start, observed.mask)
 

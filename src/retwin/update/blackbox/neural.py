@@ -60,7 +60,7 @@ def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) 
             return None
         equations, starts = begin_with(own, found, np.random.default_rng(seed))
         states = states_within(starts, START * max(1.0, float(np.abs(starts).max())))
-        twin = equations.trainable(observed.inputs, observed.outputs, observed.rate, states)
+        twin = equations.trainable(observed, states)
 
         def start(part: NDArray) -> BlackBoxFit:
             estimation = estimation_of(twin, observed, part)
@@ -127,8 +127,6 @@ def begin_with(
         "b": rng.normal(size=hidden),
         "W": np.zeros((size, hidden)),
     }
-    commands, outputs = (
-        ChannelScale(each.centre, each.scale)
-        for each in (linear.lags.commands, linear.lags.outputs)
-    )
+    ranges = linear.lags.commands, linear.lags.outputs
+    commands, outputs = (ChannelScale(each.centre, each.scale) for each in ranges)
     return Equations(arrays, np.where(speed > 0, speed, 1.0), commands, outputs), white[:, 0]

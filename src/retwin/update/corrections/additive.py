@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -20,10 +21,8 @@ class Additive:
     each segment has an error of its own, other operators explain more with fewer parameters.
     """
 
-    @property
-    def resolution(self) -> str:
-        """One z per sample."""
-        return "step"
+    resolution: ClassVar[str] = "step"
+    """One z per sample."""
 
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """A residual of every output, in its unit."""
@@ -41,10 +40,5 @@ class Additive:
         """z* = y - ŷ where y was measured, and nothing elsewhere; exact, so without covariance."""
         with torch.no_grad():
             z = torch.where(mask, observed - context.path, 0.0)
-        width = z.shape[-1]
-        return Discrepancy(
-            z=z,
-            covariance=z.new_zeros(*z.shape, width),
-            identified=mask.clone(),
-            noise=z.new_zeros(len(z)),
-        )
+        certain = z.new_zeros(*z.shape, z.shape[-1])
+        return Discrepancy(z, certain, identified=mask.clone(), noise=z.new_zeros(len(z)))

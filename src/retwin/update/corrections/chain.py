@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
+from retwin.checks import require
 from retwin.data.trajectories import Channels
-from retwin.errors import InputError
 from retwin.update.corrections.correction import (
     Context,
     Correction,
@@ -49,17 +49,16 @@ class Chain:
     second: Correction | SampledSensor
 
     def __post_init__(self) -> None:
-        if isinstance(self.first, SampledSensor) or sensor_of(self.first) is not None:
-            raise InputError(
-                "first",
-                expected="an operator that acts on the system, the sensor being last",
-                got=type(self.first).__name__,
-                remedy="give the sensor as the second",
-            )
-        if isinstance(self.second, SampledSensor):
-            return
-        if self.first.resolution != self.second.resolution:
-            raise InputError(
+        require(
+            not isinstance(self.first, SampledSensor) and sensor_of(self.first) is None,
+            "first",
+            expected="an operator that acts on the system, the sensor being last",
+            got=type(self.first).__name__,
+            remedy="give the sensor as the second",
+        )
+        if not isinstance(self.second, SampledSensor):
+            require(
+                self.first.resolution == self.second.resolution,
                 "second",
                 expected=f"an operator with one z per {self.first.resolution}, as the first has",
                 got=f"{type(self.second).__name__}, one per {self.second.resolution}",
@@ -90,24 +89,14 @@ class Chain:
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """Components of the first, then of the second; names of both get the operator's."""
         parts = [(each, each.latent(inputs, outputs)) for each in self._operators]
-        once = Counter(name for _, part in parts for name in part.names)
-        names = [
-            name if once[name] == 1 else f"{type(each).__name__}.{name}"
-            for each, part in parts
-            for name in part.names
-        ]
-        return Channels(tuple(names), tuple(unit for _, part in parts for unit in part.units))
+        names = _tell_apart([(each, name) for each, part in parts for name in part.names])
+        return Channels(names, tuple(unit for _, part in parts for unit in part.units))
 
     def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
         """Blocks of the first, then of the second, named likewise."""
         parts = [(each, head) for each in self._operators for head in each.heads(inputs, outputs)]
-        once = Counter(head.name for _, head in parts)
-        return tuple(
-            head
-            if once[head.name] == 1
-            else replace(head, name=f"{type(each).__name__}.{head.name}")
-            for each, head in parts
-        )
+        names = _tell_apart([(each, head.name) for each, head in parts])
+        return tuple(replace(head, name=name) for (_, head), name in zip(parts, names, strict=True))
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """The outputs after all operators, before a sensor records them."""
@@ -118,17 +107,14 @@ class Chain:
     def completed(self, context: Context, observed: Tensor, mask: Tensor) -> Chain:
         """The same, what each operator leaves open chosen as if it were alone."""
         seen = sample_mask(self, observed, mask, context.rate)
-        first = completed(self.first, context, observed, seen)
-        if isinstance(self.second, SampledSensor):
-            return replace(self, first=first)
-        return replace(self, first=first, second=completed(self.second, context, observed, seen))
+        made = [completed(each, context, observed, seen) for each in self._operators]
+        return Chain(*made) if len(made) == 2 else replace(self, first=made[0])
 
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """z* of one operator after the other, each from what those before it left."""
         if isinstance(self.second, SampledSensor):
-            return self.first.infer(
-                context, observed, sample_mask(self, observed, mask, context.rate)
-            )
+            seen = sample_mask(self, observed, mask, context.rate)
+            return self.first.infer(context, observed, seen)
         one = self.first.infer(context, observed, mask)
         with torch.no_grad():
             after = replace(context, corrected=self.first.apply(context, one.z))
@@ -146,11 +132,17 @@ class Chain:
 
     def _split(self, context: Context, z: Tensor) -> tuple[Tensor, ...]:
         """The z of each operator."""
-        inputs, outputs = (
-            Channels.numbered(name, values.shape[2])
-            for name, values in (("u", context.commands), ("y", context.nominal))
-        )
+        inputs = Channels.numbered("u", context.commands.shape[2])
+        outputs = Channels.numbered("y", context.nominal.shape[2])
         return z.split([len(each.latent(inputs, outputs)) for each in self._operators], dim=-1)
+
+
+def _tell_apart(names: Sequence[tuple[Correction, str]]) -> tuple[str, ...]:
+    """Names, with that of the operator before those that both operators have."""
+    once = Counter(name for _, name in names)
+    return tuple(
+        name if once[name] == 1 else f"{type(each).__name__}.{name}" for each, name in names
+    )
 
 
 def completed(

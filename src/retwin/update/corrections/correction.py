@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
+from retwin.inference.problem import Rows
 from retwin.update.corrections.commands.machines import Learned, OtherMachines
 
 CONSTANT = 1e-6
@@ -53,7 +55,7 @@ class Head:
 
 
 @dataclass(frozen=True, eq=False)
-class Context:
+class Context(Rows):
     """The inputs of a correction for n trajectories; an operator takes what it needs.
 
     Attributes
@@ -95,6 +97,7 @@ class Context:
     surrogate_variance: Tensor | None = None
     scale: Tensor | None = None
     others: OtherMachines | None = None
+    shared = ("surrogate", "rate", "scale", "others")
 
     def __len__(self) -> int:
         return len(self.commands)
@@ -122,19 +125,9 @@ class Context:
         own = getattr(self.surrogate, "unit", self.scale)
         return self.nominal.new_ones(self.nominal.shape[2]) if own is None else own
 
-    def __getitem__(self, index: slice | NDArray) -> Context:
+    def __getitem__(self, index: slice | NDArray | Tensor) -> Context:
         """The context of some of the trajectories."""
-        variance = self.surrogate_variance
-        return replace(
-            self,
-            surrogate_variance=None if variance is None else variance[index],
-            commands=self.commands[index],
-            faulty_commands=self.faulty_commands[index],
-            frozen=self.frozen[index],
-            nominal=self.nominal[index],
-            segments=self.segments[index],
-            corrected=self.path[index],
-        )
+        return Rows.__getitem__(replace(self, corrected=self.path), index)
 
     @classmethod
     def of(
@@ -148,22 +141,14 @@ class Context:
         frozen: NDArray | None = None,
     ) -> Context:
         """The context of those commands, without faults by default."""
-        clean = torch.tensor(commands, dtype=torch.float32)
-        nominal = torch.as_tensor(surrogate.predict(commands))
-        return cls(
-            surrogate,
-            commands=clean,
-            faulty_commands=clean
-            if faulty_commands is None
-            else torch.tensor(faulty_commands, dtype=torch.float32),
-            frozen=torch.full((len(clean), clean.shape[2]), clean.shape[1])
-            if frozen is None
-            else torch.as_tensor(frozen),
-            nominal=nominal,
-            segments=segments,
-            rate=rate,
-            scale=_scale(surrogate, nominal),
-        )
+        clean = faulty = torch.tensor(commands, dtype=torch.float32)
+        if faulty_commands is not None:
+            faulty = torch.tensor(faulty_commands, dtype=torch.float32)
+        if frozen is None:
+            frozen = np.full((len(clean), clean.shape[2]), clean.shape[1])
+        nominal, since = torch.as_tensor(surrogate.predict(commands)), torch.as_tensor(frozen)
+        scale = _scale(surrogate, nominal)
+        return cls(surrogate, clean, faulty, since, nominal, segments, rate, scale=scale)
 
 
 def _scale(surrogate: DifferentiableTwin, nominal: Tensor) -> Tensor | None:

@@ -8,14 +8,13 @@ motion ends at `settle + TDe` with its own. So the path is continuous whatever z
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from retwin.checks import positive
 from retwin.data.trajectories import Channels
-from retwin.inference.em import expectation_maximisation
 from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
@@ -68,6 +67,8 @@ class DelayOffset:
 
     """
 
+    resolution: ClassVar[str] = "segment"
+    """One z per segment."""
     delay_range: tuple[float, float] | None = None
     known_delay: float | None = None
 
@@ -77,20 +78,14 @@ class DelayOffset:
             positive("known_delay", self.known_delay)
 
     @property
-    def resolution(self) -> str:
-        """One z per segment."""
-        return "segment"
-
-    @property
     def pools(self) -> bool:
         """`infer` learns the range of delays from all trajectories together, unless it is given."""
         return self.delay_range is None
 
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """`delay` in samples, then one offset per output in its unit."""
-        return Channels(
-            ("delay", *(f"offset_{name}" for name in outputs.names)), ("samples", *outputs.units)
-        )
+        names = ("delay", *(f"offset_{name}" for name in outputs.names))
+        return Channels(names, ("samples", *outputs.units))
 
     def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
         """A mixture for the delay, another for the offset (section 4.2.3)."""
@@ -121,18 +116,13 @@ class DelayOffset:
         limits = range_in_samples(self.delay_range, context, observed, mask)
         parts = [
             self._infer(context[some], observed[some], mask[some], limits)
-            for some in np.split(
-                np.arange(len(context)),
-                np.arange(TRAJECTORIES_PER_BATCH, len(context), TRAJECTORIES_PER_BATCH),
-            )
+            for some in torch.arange(len(context)).split(TRAJECTORIES_PER_BATCH)
         ]
-        return Discrepancy(
-            torch.cat([part.z for part in parts]),
-            torch.cat([part.covariance for part in parts]),
-            torch.cat([part.identified for part in parts]),
-            torch.cat([part.noise for part in parts]),
-            at_bound=torch.cat([part.at_bound for part in parts if part.at_bound is not None]),
-        )
+        names = ("z", "covariance", "identified", "noise", "at_bound")
+        columns: dict[str, Any] = {
+            name: torch.cat([getattr(part, name) for part in parts]) for name in names
+        }
+        return Discrepancy(**columns)
 
     def _infer(
         self, context: Context, observed: Tensor, mask: Tensor, limits: tuple[float, float]
@@ -148,24 +138,19 @@ class DelayOffset:
         z[..., 1:] = problem.first_offset(limits[1])
         z[..., 0] = first_delays(problem, z.flatten(1), limits)
         problem = problem.with_motion(z[..., 0])
-        bounds = problem.bounds
-        learned = _learned(problem, problem.residual(z.flatten(1)))
+        x = z.flatten(1)
+        noise, prior = _learned(problem, problem.residual(x))
         # A fast motion half a sample beside the grid is beyond the cutoff of Tukey's loss, and the
         # rounding of the few samples that count would decide where its delay goes from there.
-        first = replace(learned[0], loss=StudentT()), learned[1]
-        solution, learned = expectation_maximisation(
-            Solution.of_prior(learned[1], z.flatten(1)),
-            first,
-            infer=lambda found, given: solve(
-                problem, given[1], given[0], found.x, bounds=bounds, reweightings=1
-            ),
-            learn=lambda found, _: _learned(problem, problem.residual(found.x)),
-            rounds=ROUNDS,
-        )
+        noise = replace(noise, loss=StudentT())
+        for _ in range(ROUNDS):
+            solution = solve(problem, prior, noise, x, bounds=problem.bounds, reweightings=1)
+            x = solution.x
+            noise, prior = _learned(problem, problem.residual(x))
         known = KNOWN_DELAY * problem.width
         if self.known_delay is not None:
             known = self.known_delay * context.rate
-        found = _discrepancy(problem, solution, *learned, unit, known)
+        found = _discrepancy(problem, solution, noise, prior, unit, known)
         if context.surrogate_variance is None:
             return found
         # At rest the surrogate's error is an offset.
@@ -207,13 +192,9 @@ def _discrepancy(
     identified = identified & valid[..., None]
     scale = torch.cat([unit.new_ones(1), unit])
     steady = torch.where(problem.measured > 0, noise.scale[problem.group][..., 0], torch.inf)
-    return Discrepancy(
-        z * scale,
-        covariance * scale[:, None] * scale,
-        identified,
-        steady.amin(dim=1) * unit.mean(),
-        at_bound=bounded,
-    )
+    covariance = covariance * scale[:, None] * scale
+    left = steady.amin(dim=1) * unit.mean()
+    return Discrepancy(z * scale, covariance, identified, left, at_bound=bounded)
 
 
 def _moves(problem: PathProblem, z: Tensor, deviation: Tensor) -> Tensor:
@@ -221,9 +202,7 @@ def _moves(problem: PathProblem, z: Tensor, deviation: Tensor) -> Tensor:
 
     A step between two offsets has a place, and so a delay, also where noise alone made it.
     """
-    start, settle = (
-        torch.as_tensor(getattr(problem.segments, each)) for each in ("start", "settle")
-    )
+    start, settle = map(torch.as_tensor, (problem.segments.start, problem.segments.settle))
     way = path_at(problem.segments, problem.path, z).diff(dim=1, prepend=problem.path[:, :1]).abs()
     inside = within(problem.sample, start + z[..., 0], settle + z[..., 0] + 1)
     variance = deviation[..., 1:].square()

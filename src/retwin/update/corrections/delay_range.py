@@ -122,10 +122,8 @@ def plausible_delays(context: Context, observed: Tensor, mask: Tensor) -> tuple[
         half *= 2
     margin = max(abs(low), abs(high), high - low, least)
     longest = segments.steps
-    return (
-        float(max(math.floor(low - margin), -longest)),
-        float(min(math.ceil(high + margin), longest)),
-    )
+    low, high = max(math.floor(low - margin), -longest), min(math.ceil(high + margin), longest)
+    return float(low), float(high)
 
 
 def _moves(problem: PathProblem, x: Tensor) -> Tensor:

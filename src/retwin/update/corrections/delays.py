@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Protocol
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from retwin.data.segments import Segments
-from retwin.inference.problem import Problem
+from retwin.inference.problem import Rows
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.warp import within
 
@@ -19,8 +20,9 @@ AT_BOUND = 1e-3
 """Distance from a bound, in widths of the range, within which a delay is at that bound."""
 
 
-class DelayProblem(Problem, Protocol):
-    """A problem whose latent variables are, of every segment, a delay in samples and others.
+@dataclass(frozen=True, eq=False)
+class DelayProblem(Rows, ABC):
+    """A problem whose latent variables x are, of every segment, a delay in samples and others.
 
     Attributes
     ----------
@@ -28,19 +30,41 @@ class DelayProblem(Problem, Protocol):
         M at most.
     sample : Tensor
         (K,) or (R, K), the sample of each row of the residual.
+    measured, group, observed : Tensor
+        (R, K), (R, K) and (R, K, d), see `Problem`; and the measured outputs.
+    delay_range : tuple of float
+        Smallest and largest delay, in samples.
 
     """
 
-    @property
-    def segments(self) -> Segments:
-        """M at most."""
+    segments: Segments
+    sample: Tensor
+    measured: Tensor
+    group: Tensor
+    observed: Tensor
+    delay_range: tuple[float, float]
 
     @property
-    def sample(self) -> Tensor:
-        """(K,) or (R, K)."""
+    def width(self) -> float:
+        """Of the range of delays, in samples."""
+        return self.delay_range[1] - self.delay_range[0]
 
     def per_segment(self, x: Tensor) -> Tensor:
-        """A view of x (R, P) by segment, (R, M, P / M), the delay first."""
+        """Values (R, P) or (R, P, …) by segment, (R, M, P / M, …), the delay first."""
+        return x.unflatten(1, (self.segments.max_count, -1))
+
+    def at_rest(self, margin: float) -> Tensor:
+        """(R, M, K) bool, the samples at rest, `margin` samples after the motion.
+
+        Of a short rest its second half counts.
+        """
+        settle, stop = map(torch.as_tensor, (self.segments.settle, self.segments.stop))
+        begin = settle + torch.full_like(settle, margin).minimum((stop - settle) / 2)
+        return within(self.sample, begin, stop.ceil() - 1)
+
+    @abstractmethod
+    def residual(self, x: Tensor) -> Tensor:
+        """See `Problem`."""
 
 
 def first_delays(problem: DelayProblem, x: Tensor, delay_range: tuple[float, float]) -> Tensor:

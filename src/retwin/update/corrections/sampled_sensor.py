@@ -15,9 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.data.segments import Segments
-from retwin.errors import InputError
 from retwin.update.corrections.warp import gather_samples
 from retwin.update.kernels.generation import joined_samples
 
@@ -84,14 +83,14 @@ class SampledSensor:
             and 0 <= (self.glitch_probability or 0.0) <= 1
             and all(len(q) > 1 and sorted(q) == list(q) for q in self.noise or ())
         )
-        if not sound:
-            raise InputError(
-                "sensor",
-                expected="a period in seconds above 0, phases from 0 to below it, finite sizes of "
-                "at least 0, rising quantiles and a probability from 0 to 1",
-                got=repr(self),
-                remedy="leave out what you do not know: it is fitted from data",
-            )
+        require(
+            sound,
+            "sensor",
+            expected="a period in seconds above 0, phases from 0 to below it, finite sizes of "
+            "at least 0, rising quantiles and a probability from 0 to 1",
+            got=repr(self),
+            remedy="leave out what you do not know: it is fitted from data",
+        )
 
     def timing(self, rate: float) -> tuple[int, tuple[int, ...] | None]:
         """Sampling period and phases in time steps at `rate` in Hz, where a period is given.
@@ -102,19 +101,14 @@ class SampledSensor:
             No period is given, or it is no whole number of time steps.
 
         """
-        if self.period is None:
-            raise InputError(
-                "sensor",
-                expected="one whose timing is known",
-                got=repr(self),
-                remedy="call timed or fitted first",
-            )
-        every = round(self.period * rate)
+        expected, remedy = "one whose timing is known", "call timed or fitted first"
+        period = given("sensor", self.period, expected, got=repr(self), remedy=remedy)
+        every = round(period * rate)
         require(
-            every >= 1 and abs(self.period * rate - every) <= ROUNDING,
+            every >= 1 and abs(period * rate - every) <= ROUNDING,
             "sensor.period",
             expected=f"a whole number of time steps of {1 / rate:g} s",
-            got=f"{self.period:g} s",
+            got=f"{period:g} s",
             remedy="leave it out: it is fitted from data",
         )
         if self.phases is None:
@@ -126,10 +120,8 @@ class SampledSensor:
         if self.period is None:
             every, phases = _timing(observed, mask)
         else:
-            every, given = self.timing(rate)
-            phases = given or tuple(
-                sorted(set(_phases(_kinks(_bends(observed, mask), every)).tolist()))
-            )
+            every, known = self.timing(rate)
+            phases = known or _list_phases(_kinks(_bends(observed, mask), every))
         made = replace(self, period=every / rate, phases=tuple(each / rate for each in phases))
         if made.steps is not None:
             return made
@@ -152,15 +144,12 @@ class SampledSensor:
         # An error is as likely as its opposite.
         plain = np.concatenate([errors[~gross], -errors[~gross], np.zeros((1, len(regular)))])
         strong = np.sqrt(np.square(errors[gross]).mean(axis=0)) if gross.any() else 0 * regular
-        return made._filled(
-            noise=tuple(tuple(np.quantile(each, LEVELS).tolist()) for each in plain.T),
-            glitch_probability=float(gross.mean()) if len(gross) else 0.0,
-            glitch_size=tuple(strong.tolist()),
-        )
-
-    def _filled(self, **found: Any) -> SampledSensor:
-        """Itself, with what was found where nothing was given."""
-        return replace(self, **{k: v for k, v in found.items() if getattr(self, k) is None})
+        found: dict[str, Any] = {
+            "noise": tuple(tuple(np.quantile(each, LEVELS).tolist()) for each in plain.T),
+            "glitch_probability": float(gross.mean()) if len(gross) else 0.0,
+            "glitch_size": tuple(strong.tolist()),
+        }
+        return replace(made, **{k: v for k, v in found.items() if getattr(made, k) is None})
 
     def sample_mask(self, observed: Tensor, mask: Tensor, rate: float) -> Tensor:
         """`mask` (n, T, d_y) where a record was sampled; in between it has no information."""
@@ -252,7 +241,7 @@ def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:
         kinks = _kinks(bends, every)
         plain = _plain(kinks)
         if 2 * plain.sum() > (kinks.amax(dim=1) > 0).sum():
-            return every, tuple(sorted(set(_phases(kinks).tolist())))
+            return every, _list_phases(kinks)
     return 1, (0,)
 
 
@@ -291,6 +280,11 @@ def _phases(kinks: Tensor) -> Tensor:
     return own if not plain.any() else torch.where(plain, own, own[plain].mode().values)
 
 
+def _list_phases(kinks: Tensor) -> tuple[int, ...]:
+    """The phases that trajectories have, in order."""
+    return tuple(sorted(set(_phases(kinks).tolist())))
+
+
 def lattice_step(samples: NDArray) -> float:
     """The distance of neighbouring values of one output, 0 where there is no lattice."""
     values = np.unique(samples)
@@ -299,9 +293,8 @@ def lattice_step(samples: NDArray) -> float:
     distances = np.diff(values)
     step = float(distances[distances > 1e-6 * np.abs(values).max()].min(initial=np.inf))
     multiples = (values - values[0]) / step
-    return (
-        step if np.isfinite(step) and np.abs(multiples - np.round(multiples)).max() < 0.05 else 0.0
-    )
+    regular = np.isfinite(step) and np.abs(multiples - np.round(multiples)).max() < 0.05
+    return step if regular else 0.0
 
 
 def _at_rest(errors: Tensor, read: Tensor, segments: Segments) -> NDArray:

@@ -30,10 +30,8 @@ def slopes_at(surrogate: DifferentiableTwin, commands: Tensor) -> tuple[Tensor, 
     with torch.enable_grad():
         inputs = different[None].requires_grad_()
         outputs = surrogate(inputs)
-        rows = [
-            torch.autograd.grad(each.sum(), inputs, retain_graph=True)[0]
-            for each in outputs.unbind(dim=-1)
-        ]
+        sums = outputs.flatten(0, -2).sum(dim=0)
+        rows = [torch.autograd.grad(each, inputs, retain_graph=True)[0] for each in sums]
     return outputs.detach()[0, place], torch.cat(rows).movedim(0, 1)[place]
 
 

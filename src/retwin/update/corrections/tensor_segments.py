@@ -35,8 +35,6 @@ class TensorSegments:
     @classmethod
     def on(cls, device: torch.device, segments: Segments) -> TensorSegments:
         """The same segments on a device."""
-        start, settle, stop, valid = (
-            torch.from_numpy(each).to(device)
-            for each in (segments.start, segments.settle, segments.stop, segments.valid)
-        )
+        times = (segments.start, segments.settle, segments.stop, segments.valid)
+        start, settle, stop, valid = (torch.from_numpy(each).to(device) for each in times)
         return cls(start, settle, stop, valid, segments.steps, segments.max_count)

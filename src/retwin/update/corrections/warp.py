@@ -42,13 +42,9 @@ class Knots:
     @classmethod
     def of(cls, segments: Segments, delay: Tensor, times: Tensor | None = None) -> Knots:
         """The knots for delays (n, M) in samples, at every sample or at `times` (n, S)."""
-        source = torch.stack(
-            [
-                torch.as_tensor(segments.start, dtype=delay.dtype),
-                torch.as_tensor(segments.settle, dtype=delay.dtype),
-            ],
-            -1,
-        ).flatten(1)
+        ends = (segments.start, segments.settle)
+        source = torch.stack([torch.as_tensor(each, dtype=delay.dtype) for each in ends], dim=-1)
+        source = source.flatten(1)
         valid = torch.as_tensor(segments.valid)
         shift = (delay * valid).repeat_interleave(2, dim=1)
         # A segment cannot begin before the previous motion has ended, however the delays differ.

@@ -44,28 +44,17 @@ def along_pieces(surrogate: Any, commands: NDArray) -> NDArray | None:
     return out
 
 
-def at_effective_commands(
-    surrogate: Any, reference: Tensor, segments: Segments, z: Tensor, when: Tensor, frozen: Tensor
-) -> Tensor | None:
-    """The outputs (n, S, d_y) at the samples `when` (n, S) of effective commands.
-
-    See `effective_commands` for the other arguments.
-    """
-    kernel, packed = library(), _pack(surrogate)
+def at_effective_commands(context: Any, z: Tensor, when: Tensor) -> Tensor | None:
+    """The outputs (n, S, d_y) at the samples `when` (n, S) of effective commands of a `Context`."""
+    reference, segments, frozen = context.faulty_commands, context.segments, context.frozen
+    kernel, packed = library(), _pack(context.surrogate)
     plain = _plain(reference, z) and not when.is_floating_point() and len(reference) == len(z)
     if kernel is None or packed is None or not plain or not reference.numel():
         return None
     n, steps, _ = reference.shape
     out = np.empty((n, when.shape[1], len(packed[2])), np.float32)
     size = reference.abs().amax(dim=0).amax(dim=0).double().numpy()
-    rows = (
-        _floats(reference),
-        *_times(segments),
-        _floats(z),
-        _doubles(frozen),
-        _doubles(when),
-        out,
-    )
+    rows = (_floats(reference), *_times(segments), _floats(z), *map(_doubles, (frozen, when)), out)
     sizes = (n, steps, segments.max_count, when.shape[1])
     call(kernel, "executed", sizes, 0.0, (*packed[:2], size), rows)
     return torch.from_numpy(out)
@@ -108,21 +97,10 @@ def effective_commands_at(
     return torch.from_numpy(out)
 
 
-def linearised_outputs(
-    surrogate: Any,
-    reference: Tensor,
-    segments: Segments,
-    x: Tensor,
-    missed: Tensor,
-    times: Tensor,
-    frozen: Tensor,
-    *,
-    unit: Tensor,
-    step: float,
-) -> tuple[Tensor, Tensor] | None:
-    """The outputs that `CommandProblem` predicts, and their Jacobian by x.
+def linearised_outputs(problem: Any, x: Tensor, step: float) -> tuple[Tensor, Tensor] | None:
+    """The outputs that a `CommandProblem` predicts, and their Jacobian by x.
 
-    See there for the arguments; finite differences of the commands have the step `step`.
+    Finite differences of the commands have the step `step`.
 
     Returns
     -------
@@ -133,29 +111,19 @@ def linearised_outputs(
         (n, S, d_y, P), the derivatives of the outputs in `unit`.
 
     """
-    kernel, packed = library(), _pack(getattr(surrogate, "single", surrogate))
-    if kernel is None or packed is None or x.dtype != torch.float64 or not x.numel():
+    kernel, packed = library(), _pack(getattr(problem.surrogate, "single", problem.surrogate))
+    (n, samples), reference = problem.sample.shape, problem.reference
+    suits = x.dtype == torch.float64 and x.numel() and samples
+    if kernel is None or packed is None or not suits:
         return None
-    (n, samples), (steps, width), outputs = times.shape, reference.shape[1:], len(packed[2])
-    if not samples:
-        return None
-    count, own = segments.max_count, x.shape[1] > segments.max_count * (1 + width)
-    found = np.empty((n, samples, outputs))
+    found = np.empty((n, samples, len(packed[2])))
     jacobian = np.empty((*found.shape, x.shape[1]))
     size = reference.abs().amax(dim=0).amax(dim=0).clamp_min(1e-12)
-    given = (
-        _doubles(reference),
-        *_times(segments),
-        *map(_doubles, (x, missed, frozen, times)),
-    )
-    call(
-        kernel,
-        "linearised",
-        (n, steps, count, samples, int(own)),
-        step,
-        (*packed[:2], _doubles(size), _doubles(unit)),
-        (*given, found, jacobian),
-    )
+    sizes = n, reference.shape[1], problem.segments.max_count, samples, int(problem.own_delays)
+    common = (*packed[:2], _doubles(size), _doubles(problem.unit))
+    rows = map(_doubles, (x, problem.missed, problem.frozen, problem.sample))
+    given = (_doubles(reference), *_times(problem.segments), *rows)
+    call(kernel, "linearised", sizes, step, common, (*given, found, jacobian))
     return torch.from_numpy(found), torch.from_numpy(jacobian)
 
 
@@ -178,7 +146,8 @@ def joined_samples(values: Tensor, phase: Tensor, steps: int, every: int) -> Ten
     n, samples, width = values.shape
     out = np.empty((n, steps, width), np.float32)
     sizes = (n, steps, samples, every, width)
-    call(kernel, "joined", sizes, 0.0, (), (_floats(values), _whole(phase), out))
+    phases = np.ascontiguousarray(phase.numpy(), np.int64)
+    call(kernel, "joined", sizes, 0.0, (), (_floats(values), phases, out))
     return torch.from_numpy(out)
 
 
@@ -231,7 +200,3 @@ def _floats(values: Tensor) -> NDArray:
 
 def _doubles(values: Tensor) -> NDArray:
     return np.ascontiguousarray(values.detach().numpy(), np.float64)
-
-
-def _whole(values: Tensor) -> NDArray:
-    return np.ascontiguousarray(values.numpy(), np.int64)

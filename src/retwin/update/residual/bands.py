@@ -84,22 +84,17 @@ def coverage_figures(
         remedy = "take another one, such as Additive()"
         if sensor_of(model.correction) is None:
             remedy += ", or end it with a SampledSensor() if measurement noise is what it lacks"
+        operators = " and ".join(_operators(model.correction))
         warnings.warn(
             f"correction: bands of 90 % hold {listed} of the calibration itself, since "
-            f"{_operators(model)} cannot express what was measured; {remedy} (docs/correct.md)",
+            f"{operators} cannot express what was measured; {remedy} (docs/correct.md)",
             stacklevel=4,
         )
     return figures
 
 
-def _operators(model: Residual) -> str:
-    """The operators of the correction, in series."""
-    rest: list[object] = [model.correction]
-    names = []
-    while rest:
-        each = rest.pop()
-        if isinstance(each, Chain):
-            rest += [each.second, each.first]
-        else:
-            names.append(type(each).__name__)
-    return " and ".join(names)
+def _operators(correction: object) -> list[str]:
+    """The names of the operators of a correction, in series."""
+    if isinstance(correction, Chain):
+        return [*_operators(correction.first), *_operators(correction.second)]
+    return [type(correction).__name__]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Required, TypedDict, TypeVar, Unpack, overload
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,41 +18,29 @@ from retwin.data.quality.check import doubtful
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
-from retwin.nets.training import Fit, isolated
+from retwin.nets.training import isolated
 from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_from
 from retwin.twins.twin import Twin
-from retwin.update.corrections import (
-    Context,
-    Correction,
-    DelayOffset,
-    Discrepancy,
-    fit_correction,
-    sample_mask,
-)
+from retwin.update.corrections import Context, Correction, DelayOffset, Discrepancy
+from retwin.update.corrections.chain import fit_correction, sample_mask
 from retwin.update.corrections.delay_range import bound_note
-from retwin.update.exact import ExactSurrogate, exact_surrogate
+from retwin.update.exact import exact_surrogate
 from retwin.update.residual.bands import coverage_figures
 from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.priors import Priors, other_machines
 from retwin.update.residual.refining import refine
 from retwin.update.residual.residual import Residual, segment
 from retwin.update.residual.segment_fitting import fit_segments
-from retwin.update.residual.sequence import SequenceMixture, SequenceResidual
+from retwin.update.residual.sequence import SequenceMixture
 from retwin.update.residual.sequence_fitting import fit_sequence
 from retwin.update.residual.settings import Density, Mixture
-from retwin.update.residual.stationary import (
-    StationaryNoise,
-    StationaryResidual,
-    fit_stationary,
-)
-from retwin.update.residual.targets import Targets
+from retwin.update.residual.stationary import StationaryNoise, fit_stationary
+from retwin.update.residual.targets import ResidualTask, Targets
 from retwin.update.surrogate import Surrogate
 from retwin.update.surrogate_error import surrogate_variance, warn_of_error
 from retwin.update.training_range import checked_once, training_checked
-
-R = TypeVar("R", bound=Residual)
 
 
 @checked_once
@@ -93,48 +81,6 @@ def infer_discrepancy(
     return context, correction.infer(context, *_measured(trajectories))
 
 
-class Options(TypedDict, total=False):
-    """The keyword arguments of `fit_residual`."""
-
-    seed: Required[int]
-    calibrate_on: str | Mapping[str, Fault | None]
-    bounds: NDArray | None
-    segments: Segments | str
-    twin: Twin | None
-    prior: Priors | None
-    progress: Progress | None
-
-
-@overload
-def fit_residual(
-    surrogate: Surrogate | Twin,
-    calibration: Trajectories,
-    correction: Correction = ...,
-    density: Density = ...,
-    **options: Unpack[Options],
-) -> ResidualModel: ...
-
-
-@overload
-def fit_residual(
-    surrogate: Surrogate | Twin,
-    calibration: Trajectories,
-    correction: Correction,
-    density: SequenceMixture,
-    **options: Unpack[Options],
-) -> SequenceResidual: ...
-
-
-@overload
-def fit_residual(
-    surrogate: Surrogate | Twin,
-    calibration: Trajectories,
-    correction: Correction,
-    density: StationaryNoise,
-    **options: Unpack[Options],
-) -> StationaryResidual: ...
-
-
 def fit_residual(
     surrogate: Surrogate | Twin,
     calibration: Trajectories,
@@ -148,7 +94,7 @@ def fit_residual(
     twin: Twin | None = None,
     prior: Priors | None = None,
     progress: Progress | None = None,
-) -> ResidualModel | SequenceResidual | StationaryResidual:
+) -> Residual[Any]:
     """Fit the residual model to measured trajectories, from outputs alone (Eq. 7–10).
 
     Parameters
@@ -188,8 +134,9 @@ def fit_residual(
 
     Returns
     -------
-    ResidualModel, SequenceResidual or StationaryResidual
-        One of the last two for a `SequenceMixture` and `StationaryNoise`.
+    Residual
+        A `ResidualModel`; for a `SequenceMixture` a `SequenceResidual`, and for `StationaryNoise`
+        a `StationaryResidual`.
 
     Raises
     ------
@@ -200,17 +147,14 @@ def fit_residual(
     """
     surrogate = exact_surrogate(surrogate)
     others = other_machines(prior, correction, surrogate)
-    instance(
-        "calibration", calibration, Trajectories, remedy="load recorded ones, or simulate a twin"
-    )
+    remedy = "load recorded ones, or simulate a twin"
+    instance("calibration", calibration, Trajectories, remedy=remedy)
     remedy = "load the file with its case, or convert it"
     agree("calibration", calibration, surrogate, "that of the surrogate", remedy=remedy)
-    stepwise = correction.resolution == "step" or isinstance(
-        density, SequenceMixture | StationaryNoise
-    )
-    keep, faults = _chosen(
-        calibration, calibrate_on, getattr(correction, "severities", False), 1 if stepwise else 3
-    )
+    by_sample = isinstance(density, SequenceMixture | StationaryNoise)
+    stepwise = correction.resolution == "step" or by_sample
+    severities = getattr(correction, "severities", False)
+    keep, faults = _chosen(calibration, calibrate_on, severities, 1 if stepwise else 3)
     used = calibration[keep]
     missing = "; ".join(filter(None, [unmeasured(used), doubtful(used)]))
     if missing:
@@ -219,13 +163,8 @@ def fit_residual(
     rule, parts = _segmented(used, given, needed=not stepwise)
     with training_checked(surrogate, used.commands) as outside:
         context = replace(_context(surrogate, used, parts, faults, twin), others=others)
-        exact: object = surrogate
-        if (
-            stepwise
-            and isinstance(exact, ExactSurrogate)
-            and exact.unknown_starts
-            and len(used) > 1
-        ):
+        exact: Any = surrogate
+        if stepwise and len(used) > 1 and getattr(exact, "unknown_starts", False):
             # Errors of the mean start are none of the outputs, and differ between records.
             context = replace(context, nominal=torch.as_tensor(exact.fitted_outputs(used)))
         warn_of_error(context, used)
@@ -237,24 +176,25 @@ def fit_residual(
         got=f"{int(used.mask.all(axis=2).sum())} samples with all outputs measured",
         remedy="check the mask; leave an output out that is never measured",
     )
+    task = ResidualTask(used, correction, context, found, bounds, seed, progress)
     if isinstance(density, StationaryNoise):
-        return _noted(fit_stationary(used, correction, density, found), outside, missing)
-    if isinstance(density, SequenceMixture):
-        sequence = fit_sequence(
-            used, correction, density, context, found, seed=seed, bounds=bounds, progress=progress
-        )
-        return _noted(sequence, outside, missing)
-    with isolated(seed):
-        model = ResidualModel(
-            correction, density, inputs=used.inputs, outputs=used.outputs, segmentation=rule
-        )
-    model.fitted = _fit_per_segment(
-        model, used, context, found, parts.valid, bounds=bounds, seed=seed, progress=progress
-    )
-    onsets = Segments.from_commands(calibration.commands)
-    model.timing = np.where(onsets.valid, onsets.start, np.nan)
+        model: Residual[Any] = fit_stationary(task, density)
+    elif isinstance(density, SequenceMixture):
+        model = fit_sequence(task, density)
+    else:
+        model = _fit_per_segment(task, density, rule)
+        onsets = Segments.from_commands(calibration.commands)
+        model.timing = np.where(onsets.valid, onsets.start, np.nan)
     model.emulated, model.learned = used.emulated, found.learned
-    return _noted(model.eval(), outside, missing, "" if others is None else others.text)
+    assert model.fitted is not None, "it has just been fitted"
+    notes = [
+        model.fitted.reason,
+        f"commands outside the surrogate's training: {outside}" if outside else "",
+        missing,
+        "" if others is None else others.text,
+    ]
+    model.fitted = replace(model.fitted, reason="; ".join(filter(None, notes)))
+    return model.eval()
 
 
 def _segmented(
@@ -275,57 +215,35 @@ def _segmented(
     return rule, parts
 
 
-def _fit_per_segment(
-    model: ResidualModel,
-    used: Trajectories,
-    context: Context,
-    found: Discrepancy,
-    valid: NDArray,
-    *,
-    bounds: NDArray | None,
-    seed: int,
-    progress: Progress | None,
-) -> Fit:
-    """Fit the distribution of one z per segment, (n, M) `valid`, and refine it if it is set so."""
-    targets = Targets.of(model, context, found, seed=seed)
-    result, held_out = fit_segments(model, targets, bounds=bounds, seed=seed, progress=progress)
+def _fit_per_segment(task: ResidualTask, density: Density, rule: str) -> ResidualModel:
+    """The distribution of one z per segment, which that rule finds; refined if it is set so."""
+    used, context, found = task.used, task.context, task.found
+    with isolated(task.seed):
+        model = ResidualModel(
+            task.correction, density, inputs=used.inputs, outputs=used.outputs, segmentation=rule
+        )
+    valid = context.segments.valid
+    result, held_out = fit_segments(model, Targets.of(model, context, found, seed=task.seed), task)
     held_out = held_out[held_out < len(used)]  # a run that was predicted has no outputs
     figures = {"trajectories": float(len(used)), "movements": float(valid.sum())}
     if found.at_bound is not None:
         figures["delays_at_bound"] = share = float(found.at_bound.double()[valid].mean())
         result = replace(result, reason="; ".join(filter(None, [result.reason, bound_note(share)])))
-    refinement = model.density.refinement
     observed, mask = _measured(used)
     sampled = sample_mask(model.correction, observed, mask, used.rate)
-    if refinement is not None and len(held_out):
+    if density.refinement is not None and len(held_out):
         fitted = np.setdiff1d(np.arange(len(used)), held_out)
         figures |= refine(
             model, context, observed, sampled, fitted=torch.as_tensor(fitted), held_out=held_out,
-            how=refinement, seed=seed, progress=progress,
+            how=density.refinement, seed=task.seed, progress=task.progress,
         )  # fmt: skip
     healthy = (context.faulty_commands == context.commands).flatten(1).all(dim=1)
     rows = (healthy & (context.frozen >= context.commands.shape[1]).all(dim=1)).nonzero().flatten()
     if len(rows):
         model.eval()
-        figures |= coverage_figures(
-            model, context[rows.numpy()], observed[rows], sampled[rows], seed=seed
-        )
-    return replace(result, figures=figures | result.figures)
-
-
-def _noted(model: R, outside: str, missing: str, prior: str = "") -> R:
-    """The model; its record states the commands that the surrogate was not trained on.
-
-    It also states in which trajectories nothing was measured, and where its prior came from.
-    """
-    notes = [
-        f"commands outside the surrogate's training: {outside}" if outside else "",
-        missing,
-        prior,
-    ]
-    if model.fitted is not None:
-        reason = "; ".join(filter(None, [model.fitted.reason, *notes]))
-        model.fitted = replace(model.fitted, reason=reason)
+        some = context[rows.numpy()], observed[rows], sampled[rows]
+        figures |= coverage_figures(model, *some, seed=task.seed)
+    model.fitted = replace(result, figures=figures | result.figures)
     return model
 
 

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from retwin.checks import require
 from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.nets.networks import Standardise
 from retwin.nets.student import Student, shared_factor
 from retwin.update.corrections import Context
+from retwin.update.corrections.warp import gather_samples
 from retwin.update.residual.residual import Residual
 from retwin.update.residual.settings import Density
 
@@ -43,16 +43,12 @@ class ResidualModel(Residual[Density]):
     """
 
     kind = "residual"
-
-    def _check_correction(self) -> None:
-        require(
-            getattr(self.correction, "resolution", "") == "segment",
-            "correction",
-            expected="an operator with one z per segment",
-            got=repr(self.correction),
-            remedy="use DelayOffset, CommandSpace, or a Chain of one with a SampledSensor; or, for "
-            "one z per sample, a SequenceMixture as the density",
-        )
+    resolution = "segment"
+    wanted = "an operator with one z per segment"
+    remedy = (
+        "use DelayOffset, CommandSpace, or a Chain of one with a SampledSensor; or, for one z per "
+        "sample, a SequenceMixture as the density"
+    )
 
     def _build(self) -> None:
         features, density = 3 * (len(self.inputs) + len(self.outputs)) + 2, self.density
@@ -99,17 +95,14 @@ class ResidualModel(Residual[Density]):
         # A graph that is exported has no branches that depend on values.
         if torch.compiler.is_compiling() or bool((self.spread != 1).any()):
             predicted = predicted.widened(self.spread)
-        parts = zip(predicted.blocks, self.degrees, strict=True)
-        return Blocks(
-            [block if math.isinf(degrees) else Student(block, degrees) for block, degrees in parts]
-        )
+        pairs = zip(predicted.blocks, self.degrees, strict=True)
+        return Blocks([own if math.isinf(free) else Student(own, free) for own, free in pairs])
 
     def predict(self, features: Tensor) -> Blocks:
         """The distribution that the network predicts, before its calibration."""
         encoded = self.encoder(self.before(features))
-        parts = zip(
-            self.heads, self.shift.split(self.sizes), self.scale.split(self.sizes), strict=True
-        )
+        units = (each.split(self.sizes) for each in (self.shift, self.scale))
+        parts = zip(self.heads, *units, strict=True)
         return Blocks([head(encoded, shift, scale) for head, shift, scale in parts])
 
     @torch.no_grad()
@@ -148,14 +141,10 @@ def describe(context: Context) -> Tensor:
     the durations of the motion and of the steady part in s, all of the commands without faults.
     """
     segments = context.segments
-    start, settle, stop = (
-        torch.as_tensor(times) for times in (segments.start, segments.settle, segments.stop)
-    )
-    last = segments.steps - 1
-    columns = []
-    for when in (start, (start + settle) / 2, settle):
-        index = when.round().long().clamp(0, last)[..., None]
-        for values in (context.commands, context.nominal):
-            columns.append(values.gather(1, index.expand(-1, -1, values.shape[2])))
+    start, settle, stop = map(torch.as_tensor, (segments.start, segments.settle, segments.stop))
+    times = (start, (start + settle) / 2, settle)
+    places = [each.round().long().clamp(0, segments.steps - 1) for each in times]
+    values = (context.commands, context.nominal)
+    columns = [gather_samples(each, place) for place in places for each in values]
     lengths = torch.stack([settle - start, stop - settle], dim=-1) / context.rate
     return torch.cat([*columns, lengths.to(context.nominal)], dim=-1)

@@ -61,15 +61,9 @@ def other_machines(
         )
         remedy = f"leave {name} out: it is no machine of this kind"
         agree("prior", model, twin, "those of the twin", names=("inputs", "outputs"), remedy=remedy)
-        shown.append(
-            given(
-                "prior",
-                model.learned,
-                "models that state what their machine has shown",
-                got=f"none in {name}",
-                remedy="fit it again with this version",
-            )
-        )
+        expected, got = "models that state what their machine has shown", f"none in {name}"
+        remedy = "fit it again with this version"
+        shown.append(given("prior", model.learned, expected, got=got, remedy=remedy))
     return OtherMachines.of(shown)
 
 

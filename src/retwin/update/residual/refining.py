@@ -10,7 +10,6 @@ components are refined, in the last layer; a flow has no such limit.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -69,9 +68,23 @@ def refine(
 
     """
     features = describe(context)
-    score = _Score(context, observed, mask, _unit(observed, mask, model.outputs))
+    unit = _unit(observed, mask, model.outputs)
     frozen = [model.encoder, *(head for head in model.heads if isinstance(head, BernoulliHead))]
     fresh = torch.Generator().manual_seed(seed)
+
+    def score(network: Any, batch: tuple[Tensor, ...], draws: int, seed: int) -> Tensor:
+        """The mean energy score of so many simulations each of a batch: features and indices."""
+        features, rows = batch
+        generator = torch.Generator().manual_seed(seed)
+        distribution = network.distribution(features.repeat_interleave(draws, dim=0))
+        z = network.drawn(distribution, generator=generator)
+        every = context[rows.repeat_interleave(draws).numpy()]
+        outputs = measured_outputs(network.correction, every, z, generator) / unit
+        scores = []
+        for row, made in zip(rows.tolist(), outputs.split(draws), strict=True):
+            seen = mask[row].all(dim=-1)
+            scores.append(energy_score(made[:, seen], observed[row, seen] / unit))
+        return torch.stack(scores).mean()
 
     def loss(network: Any, batch: tuple[Tensor, ...]) -> Tensor:
         # New draws at each training step; the same in each validation, to compare epochs.
@@ -87,15 +100,8 @@ def refine(
     before, start = held_out_score(), copy.deepcopy(model.state_dict())
     for part in frozen:
         part.requires_grad_(False)
-    train(
-        model,
-        loss,
-        (features[fitted], fitted),
-        (features[held_out], held_out),
-        how.training,
-        seed=seed,
-        progress=progress,
-    )
+    sets = (features[fitted], fitted), (features[held_out], held_out)
+    train(model, loss, *sets, how.training, seed=seed, progress=progress)
     for part in frozen:
         part.requires_grad_(True)
     after = held_out_score()
@@ -103,30 +109,6 @@ def refine(
     if not kept:
         model.load_state_dict(start)
     return {"energy before": before, "energy after": after, "refined": float(kept)}
-
-
-@dataclass(frozen=True, eq=False)
-class _Score:
-    """The mean energy score of simulations of n trajectories, in units `unit` (d_y,)."""
-
-    context: Context
-    observed: Tensor
-    mask: Tensor
-    unit: Tensor
-
-    def __call__(self, network: Any, batch: tuple[Tensor, ...], draws: int, seed: int) -> Tensor:
-        """That of `draws` simulations each of a batch, which is features and indices."""
-        features, rows = batch
-        generator = torch.Generator().manual_seed(seed)
-        distribution = network.distribution(features.repeat_interleave(draws, dim=0))
-        z = network.drawn(distribution, generator=generator)
-        every = self.context[rows.repeat_interleave(draws).numpy()]
-        outputs = measured_outputs(network.correction, every, z, generator) / self.unit
-        scores = []
-        for row, made in zip(rows.tolist(), outputs.split(draws), strict=True):
-            seen = self.mask[row].all(dim=-1)
-            scores.append(energy_score(made[:, seen], self.observed[row, seen] / self.unit))
-        return torch.stack(scores).mean()
 
 
 def _unit(observed: Tensor, mask: Tensor, outputs: Channels) -> Tensor:

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import ClassVar, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retwin.catalog import CORRECTIONS, DENSITIES, NETWORKS, classes
-from retwin.checks import finite, one_of
+from retwin.checks import finite, one_of, require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import Blocks
@@ -27,6 +27,10 @@ from retwin.update.corrections.commands.machines import Learned
 from retwin.update.surrogate import Surrogate
 
 D = TypeVar("D")
+SMALLEST = 1e-12
+"""Smallest value taken for the largest |z*|: a millionth of it still has a square in float32."""
+BOUND_MARGIN = 1.25
+"""Default bound b of Eq. 9, over the largest |z*|."""
 
 
 class Residual(nn.Module, ABC, Generic[D]):
@@ -70,6 +74,10 @@ class Residual(nn.Module, ABC, Generic[D]):
 
     kind: ClassVar[str]
     """Kind of the saved model."""
+    resolution: ClassVar[str] = "step"
+    """That of the operators whose z it can have: with a z per sample, none of it is an event."""
+    wanted: ClassVar[str] = "an operator with one z per sample, none of it an event"
+    remedy: ClassVar[str] = "use Additive, or a density such as Mixture for one z per segment"
     spread: Tensor
 
     def __init__(
@@ -87,7 +95,16 @@ class Residual(nn.Module, ABC, Generic[D]):
         self.inputs = inputs
         self.outputs = outputs
         self.segmentation = segmentation
-        self._check_correction()
+        suits = getattr(correction, "resolution", "") == self.resolution
+        if suits and self.resolution == "step":
+            suits = all(each.kind == "mixture" for each in correction.heads(inputs, outputs))
+        require(
+            suits,
+            "correction",
+            expected=self.wanted,
+            got=repr(correction),
+            remedy=self.remedy,
+        )
         self.latent = correction.latent(inputs, outputs)
         self.sizes = [head.width for head in correction.heads(inputs, outputs)]
         self.degrees = [math.inf] * len(self.sizes)
@@ -102,34 +119,20 @@ class Residual(nn.Module, ABC, Generic[D]):
         self._build()
 
     @abstractmethod
-    def _check_correction(self) -> None:
-        """Raise InputError for an operator whose z this model cannot have."""
-
-    @abstractmethod
     def _build(self) -> None:
         """Make the networks, with random initial weights, and further buffers."""
 
     def context(
-        self,
-        surrogate: Surrogate,
-        commands: NDArray,
-        segments: Segments | None = None,
-        *,
-        faulty_commands: NDArray | None = None,
-        frozen: NDArray | None = None,
+        self, surrogate: Surrogate, commands: NDArray, segments: Segments | None = None, **more: Any
     ) -> Context:
-        """The context of commands (n, T, d_u), with segments by this model's rule unless given."""
+        """The context of commands (n, T, d_u), with segments by this model's rule unless given.
+
+        `faulty_commands` and `frozen` are those of `Context.of`.
+        """
         if segments is None or self.segmentation == "path":
             nominal = surrogate.predict(commands) if self.segmentation == "path" else commands
             segments = segment(commands, nominal, self.segmentation)
-        return Context.of(
-            surrogate,
-            commands,
-            segments,
-            rate=surrogate.rate,
-            faulty_commands=faulty_commands,
-            frozen=frozen,
-        )
+        return Context.of(surrogate, commands, segments, rate=surrogate.rate, **more)
 
     @abstractmethod
     def forward(self, context: Context) -> Blocks:
@@ -139,6 +142,44 @@ class Residual(nn.Module, ABC, Generic[D]):
     def mean(self, context: Context) -> Tensor:
         """The mean z̄ (n, M, d_z) of Eq. 8, clipped at b."""
         return self(context).mean.clamp(-self.bounds, self.bounds)
+
+    def penalise(self, mean: Tensor, valid: Tensor) -> Tensor:
+        """λ_s times the mean square step of z̄, plus λ_b times that of its excess over b (Eq. 9).
+
+        Steps and excess are in units of `scale`; `density` holds λ_s and λ_b.
+
+        Parameters
+        ----------
+        mean : Tensor
+            (..., n, M, d_z), z̄ over M segments or samples.
+        valid : Tensor
+            (..., n, M) bool, what is averaged over.
+
+        Returns
+        -------
+        Tensor
+            (...).
+
+        """
+        density: Any = self.density
+        step = (mean[..., 1:, :] - mean[..., :-1, :]) / self.scale
+        beyond = torch.relu(mean.abs() - self.bounds) / self.scale
+        roughness = mean_where(step.square().sum(-1), valid[..., 1:] & valid[..., :-1])
+        excess = mean_where(beyond.square().sum(-1), valid)
+        return density.smoothness * roughness + density.boundedness * excess
+
+    def take_bounds(self, bounds: NDArray | None) -> None:
+        """Take the bounds b (d_z,) of a user, if any; InputError unless all are positive."""
+        if bounds is None:
+            return
+        require(
+            np.shape(bounds) == self.bounds.shape and (np.asarray(bounds) > 0).all(),
+            "bounds",
+            expected=f"one positive bound for each of {', '.join(self.latent.names)}",
+            got=repr(bounds),
+            remedy="leave bounds out to take them from the data",
+        )
+        self.bounds.copy_(torch.as_tensor(bounds, dtype=torch.float32))
 
     @abstractmethod
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
@@ -171,13 +212,10 @@ class Residual(nn.Module, ABC, Generic[D]):
         Raises InputError if the folder holds no such residual model or is damaged.
         """
         about, weights = read_model(folder, cls.kind)
-        model = cls(
-            from_config(about["correction"], classes(CORRECTIONS)),
-            from_config(about["density"], _densities()),
-            inputs=Channels.of(about["inputs"]),
-            outputs=Channels.of(about["outputs"]),
-            segmentation=about["segmentation"],
-        )
+        correction = from_config(about["correction"], classes(CORRECTIONS))
+        density = from_config(about["density"], _densities())
+        channels = {name: Channels.of(about[name]) for name in ("inputs", "outputs")}
+        model = cls(correction, density, **channels, segmentation=about["segmentation"])
         model.load_state_dict(weights)
         model.degrees = [
             math.inf if each is None else finite("degrees", each, at_least=1)
@@ -188,6 +226,11 @@ class Residual(nn.Module, ABC, Generic[D]):
         model.fitted = Fit.of(about["fitted"])
         model.learned = about.get("learned")
         return model.eval()
+
+
+def mean_where(values: Tensor, valid: Tensor) -> Tensor:
+    """The mean (...) of values (..., n, M) that are valid."""
+    return torch.where(valid, values, 0.0).sum((-2, -1)) / valid.sum((-2, -1)).clamp_min(1)
 
 
 def _densities() -> tuple[type, ...]:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from scipy import stats
 from torch import Tensor
 
-from retwin.nets.mixtures import BernoulliHead
+from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.nets.student import widening
 from retwin.nets.training import Fit, Training, train
-from retwin.progress import Progress, part_of
+from retwin.progress import part_of
 from retwin.update.residual.model import ResidualModel
-from retwin.update.residual.penalties import BOUND_MARGIN, SMALLEST, checked_bounds, penalties
-from retwin.update.residual.targets import Targets
+from retwin.update.residual.residual import BOUND_MARGIN, SMALLEST
+from retwin.update.residual.targets import ResidualTask, Targets
 
 HELD_OUT = 20
 """Trajectories to hold out at least, over all folds: a standard deviation from twenty values has a
@@ -34,15 +34,11 @@ QUANTILE = float(stats.norm.ppf((1 + LEVEL) / 2))
 PERSISTENCES = np.linspace(0.0, 0.95, 96)
 """Values of the persistence that are equally probable before the data."""
 
+Predicted = list[tuple[Blocks, Targets]]
+"""What models predict for trajectories that they were not trained on, and the z of these."""
 
-def fit_segments(
-    model: ResidualModel,
-    targets: Targets,
-    *,
-    bounds: NDArray | None,
-    seed: int,
-    progress: Progress | None,
-) -> tuple[Fit, Tensor]:
+
+def fit_segments(model: ResidualModel, targets: Targets, task: ResidualTask) -> tuple[Fit, Tensor]:
     """Train `model` in place, and calibrate it on trajectories that it was not trained on.
 
     A fifth of the trajectories, or one, is held out for early stopping. Where that is too few to
@@ -57,12 +53,8 @@ def fit_segments(
         With its initial weights.
     targets : Targets
         z of all trajectories.
-    bounds : NDArray, optional
-        (d_z,), b of Eq. 9; by default 1.25 times the largest |z*|.
-    seed : int
-        Seed of folds, order of examples and dropout.
-    progress : callable, optional
-        Called with the share of the training that is done.
+    task : ResidualTask
+        Bounds, and the seed of folds, order of examples and dropout.
 
     Returns
     -------
@@ -76,24 +68,25 @@ def fit_segments(
     targets = targets[rows]
     # Of a single trajectory two halves are held out in turn, as if they were two.
     parts = targets if len(rows) > 1 else targets.halved()
-    folds = _folds(len(parts.valid), seed)
+    folds = _folds(len(parts.valid), task.seed)
     runs = len(folds) + (len(folds) > 1)
     members = [copy.deepcopy(model) for _ in folds] if len(folds) > 1 else [model]
     fits = []
     for k, (member, held_out) in enumerate(zip(members, folds, strict=True)):
         every = torch.arange(len(parts.valid))
         rest = every[~torch.isin(every, held_out)]
-        sets = parts[rest], parts[held_out]
-        fits.append(_trained(member, *sets, bounds, seed, part_of(progress, k, runs)))
+        own = part_of(task.progress, k, runs)
+        fits.append(_trained(member, parts[rest], parts[held_out], replace(task, progress=own)))
     with torch.no_grad():
-        unseen = [(each, parts[fold]) for each, fold in zip(members, folds, strict=True)]
-        spread = _spread(unseen)
+        pairs = zip(members, map(parts.__getitem__, folds), strict=True)
+        unseen = [(each.predict(part.features), part) for each, part in pairs]
+        spread = _spread(model, unseen)
         persistence = _persistence(unseen, single=len(rows) == 1)
     if len(folds) > 1:
         epochs = round(float(np.mean([fit.best_epoch for fit in fits])))
         how = replace(model.density.training, max_epochs=epochs)
-        last = part_of(progress, len(folds), runs)
-        refit = _trained(model, targets, None, bounds, seed, last, how)
+        last = replace(task, progress=part_of(task.progress, len(folds), runs))
+        refit = _trained(model, targets, None, last, how)
         reason = f"{epochs} epochs, as many as were best on average in {len(folds)} folds"
         fits.append(replace(refit, reason=reason))
     # Events are too few to show whether they persist.
@@ -102,11 +95,11 @@ def fit_segments(
     needed = spread * _deviation(unseen)
     if len(rows) == 1:
         # Deviations that were learned from half a trajectory are chance: the errors are a bound.
-        needed = torch.minimum(needed, _errors(unseen, model.scale))
-    ratio = needed / _deviation([(model, part) for _, part in unseen])
+        needed = torch.minimum(needed, _errors(model, unseen))
+    ratio = needed / _deviation([(model.predict(part.features), part) for _, part in unseen])
     model.spread.copy_(torch.where(model.events, 1.0, ratio.clamp_min(1.0)))
     model.degrees = _degrees(model, targets, persistence)
-    if bounds is None:
+    if task.bounds is None:
         # The largest of few |z*| is uncertain as the width is. The spread corrects the network.
         wider = torch.tensor([widening(each) for each in model.degrees])
         model.bounds.mul_(wider.repeat_interleave(torch.tensor(model.sizes)))
@@ -125,38 +118,28 @@ def _trained(
     model: ResidualModel,
     fitted: Targets,
     held_out: Targets | None,
-    bounds: NDArray | None,
-    seed: int,
-    progress: Progress | None,
+    task: ResidualTask,
     how: Training | None = None,
 ) -> Fit:
     """Train `model` in place, with units, bounds and initial heads from its training data."""
-    _prepare(model, fitted, bounds, seed)
-    return train(
-        model,
-        _objective,
-        fitted.examples(model),
-        None if held_out is None else held_out.examples(model),
-        how or model.density.training,
-        seed=seed,
-        progress=progress,
-    )
+    _prepare(model, fitted, task.bounds, task.seed)
+    sets = fitted.examples(model), None if held_out is None else held_out.examples(model)
+    how = how or model.density.training
+    return train(model, _objective, *sets, how, seed=task.seed, progress=task.progress)
 
 
-def _spread(held_out: list[tuple[ResidualModel, Targets]]) -> Tensor:
+def _spread(model: ResidualModel, held_out: Predicted) -> Tensor:
     """The factors (d_z,) with which intervals hold held-out z as often as they should, per block.
 
     By coverage and not by likelihood, which a single missed segment would dominate.
     """
-    predicted = [(model.predict(part.features), part) for model, part in held_out]
-    model = held_out[0][0]
     spread = torch.ones(len(model.latent))
     narrow = [block for head, block in model.parts() if not isinstance(head, BernoulliHead)]
     for factor in SPREADS.tolist():
         for block in narrow:
             spread[block] = factor
         held, used = [], []
-        for distribution, part in predicted:
+        for distribution, part in held_out:
             scores = distribution.widened(torch.full_like(spread, factor)).normal_scores(part.z)
             held.append((scores.abs() <= QUANTILE).float().mean(dim=0) * part.used)
             used.append(part.used)
@@ -168,38 +151,38 @@ def _spread(held_out: list[tuple[ResidualModel, Targets]]) -> Tensor:
 
 
 @torch.no_grad()
-def _deviation(held_out: list[tuple[ResidualModel, Targets]]) -> Tensor:
+def _deviation(held_out: Predicted) -> Tensor:
     """Geometric mean of the deviations (d_z,) that models predict for held-out segments."""
-    variances = [model.predict(part.features).variance[part.valid] for model, part in held_out]
+    variances = [distribution.variance[part.valid] for distribution, part in held_out]
     return (0.5 * torch.cat(variances).log().mean(dim=0)).exp()
 
 
 @torch.no_grad()
-def _errors(held_out: list[tuple[ResidualModel, Targets]], unit: Tensor) -> Tensor:
+def _errors(model: ResidualModel, held_out: Predicted) -> Tensor:
     """The deviations (d_z,) of normal distributions as wide as the errors of held-out z.
 
-    Components of a block have the same deviation in their units (d_z,).
+    Components of a block have the same deviation in their units, `ResidualModel.scale`.
     """
-    parts = [(part, model.predict(part.features).mean) for model, part in held_out]
-    error = torch.cat([((part.z - mean) / unit).abs() for part, mean in parts], dim=1)
-    used = torch.cat([part.used for part, _ in parts])
+    unit = model.scale
+    error = torch.cat([((part.z - own.mean) / unit).abs() for own, part in held_out], dim=1)
+    used = torch.cat([part.used for _, part in held_out])
     found = torch.full_like(unit, torch.inf)
-    for _, block in held_out[0][0].parts():
+    for _, block in model.parts():
         own = error[:, used[..., block].any(dim=-1)][..., block].flatten()
         if len(own):
             found[block] = own.quantile(LEVEL) / QUANTILE
     return found * unit
 
 
-def _persistence(held_out: list[tuple[ResidualModel, Targets]], *, single: bool) -> Tensor:
+def _persistence(held_out: Predicted, *, single: bool) -> Tensor:
     """Correlation (d_z,) of normal scores between the segments of a trajectory.
 
     It is the mean of its posterior given the ratio of the variances between and within held-out
     trajectories (one-way analysis of variance), all values being equally probable before the data.
     """
     scores, used = [], []
-    for model, part in held_out:
-        score = model.predict(part.features).normal_scores(part.z).mean(dim=0)
+    for distribution, part in held_out:
+        score = distribution.normal_scores(part.z).mean(dim=0)
         score = torch.where(part.used, score, torch.nan)
         # The error of a prediction from the other folds is in the mean of a fold, K / (K - 1) of
         # what the mean of all trajectories would leave there.
@@ -269,8 +252,7 @@ def _prepare(model: ResidualModel, targets: Targets, bounds: NDArray | None, see
         model.shift[part], model.scale[part] = shift, scale
         model.bounds[part] = BOUND_MARGIN * largest
         head.initialise(((values - shift) / scale).double().numpy(), seed)
-    if bounds is not None:
-        model.bounds.copy_(checked_bounds(bounds, model.latent))
+    model.take_bounds(bounds)
 
 
 def _objective(model: Any, batch: tuple[Tensor, ...]) -> Tensor:
@@ -280,4 +262,4 @@ def _objective(model: Any, batch: tuple[Tensor, ...]) -> Tensor:
     # Blocks that are not identified hold a finite placeholder and are not in the likelihood.
     log_prob = torch.where(identified, distribution.block_log_prob(z), 0.0).sum()
     nll = -log_prob / identified.sum().clamp_min(1) * identified.shape[-1]
-    return nll + penalties(model, distribution.mean, valid)
+    return nll + model.penalise(distribution.mean, valid)

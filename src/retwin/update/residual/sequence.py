@@ -166,16 +166,6 @@ class SequenceResidual(Residual[SequenceMixture]):
 
     kind = "sequence residual"
 
-    def _check_correction(self) -> None:
-        kinds = {head.kind for head in self.correction.heads(self.inputs, self.outputs)}
-        require(
-            self.correction.resolution == "step" and kinds == {"mixture"},
-            "correction",
-            expected="an operator with one z per sample, none of it an event",
-            got=repr(self.correction),
-            remedy="use Additive, or a density such as Mixture for one z per segment",
-        )
-
     def _build(self) -> None:
         self.before = Standardise(len(self.inputs) + len(self.outputs))
         self.members = self.fresh()
@@ -195,8 +185,8 @@ class SequenceResidual(Residual[SequenceMixture]):
 
     def distributions(self, features: Tensor) -> list[GaussianMixture]:
         """The calibrated distribution (K, n, T) of each block for the past (n, T, F), by member."""
-        parts = (each.split(self.sizes) for each in (self.shift, self.trust, self.spread))
-        shift, trust, spread = parts
+        units = (self.shift, self.trust, self.spread)
+        shift, trust, spread = (each.split(self.sizes) for each in units)
         return scale_deviations(shrunk(self.predict(features), shift, trust), spread)
 
     def predict(self, features: Tensor) -> list[GaussianMixture]:
@@ -230,9 +220,8 @@ class SequenceResidual(Residual[SequenceMixture]):
         drawn_from = Blocks([pick(block, chosen) for block in blocks])
         first = torch.stack([part[0] for part in self.persistence.split(self.sizes)])
         of_components = autoregressive(torch.randn(n, steps, len(first), **made), first)
-        of_values = autoregressive(
-            torch.randn(n, steps, len(self.latent), **made), self.persistence
-        )
+        noise = torch.randn(n, steps, len(self.latent), **made)
+        of_values = autoregressive(noise, self.persistence)
         z = drawn_from.from_noise(torch.special.ndtr(of_components), of_values)
         return z.clamp(-self.bounds, self.bounds)
 
@@ -248,9 +237,8 @@ def shrunk(
     """The mixtures with their means moved to `shift` plus `trust` (d,) times their distance."""
     moved = []
     for block, middle, factor in zip(blocks, shift, trust, strict=True):
-        back = (1 - factor) * (block.mean - middle)
-        means = block.means - back.unsqueeze(-2)
-        moved.append(GaussianMixture(block.mixture_distribution.logits, means, block.factor))
+        means = block.means - ((1 - factor) * (block.mean - middle)).unsqueeze(-2)
+        moved.append(GaussianMixture(block.parts[0], means, block.factor))
     return moved
 
 
@@ -258,29 +246,21 @@ def scale_deviations(
     blocks: Sequence[GaussianMixture], spread: Sequence[Tensor]
 ) -> list[GaussianMixture]:
     """The mixtures with the standard deviations of all components multiplied by `spread` (d,)."""
-    return [
-        GaussianMixture(
-            block.mixture_distribution.logits, block.means, factor[:, None] * block.factor
-        )
-        for block, factor in zip(blocks, spread, strict=True)
-    ]
+    pairs = zip(blocks, spread, strict=True)
+    return [GaussianMixture(*own.parts[:2], factor[:, None] * own.factor) for own, factor in pairs]
 
 
 def pool(members: GaussianMixture) -> GaussianMixture:
     """The mixture (...) of K mixtures (K, ...) with equal weights."""
-    logits = members.mixture_distribution.logits.log_softmax(dim=-1)
-    return GaussianMixture(
-        logits.movedim(0, -2).flatten(-2),
-        members.means.movedim(0, -3).flatten(-3, -2),
-        members.factor.movedim(0, -4).flatten(-4, -3),
-    )
+    logits, *others = members.parts
+    parts = enumerate((logits.log_softmax(dim=-1), *others), start=2)
+    return GaussianMixture(*(each.movedim(0, -d).flatten(-d, 1 - d) for d, each in parts))
 
 
 def pick(members: GaussianMixture, chosen: Tensor) -> GaussianMixture:
     """For each trajectory the mixture (n, T) of the member `chosen` (n,) of K, (K, n, T)."""
     row = torch.arange(len(chosen), device=chosen.device)
-    parts = members.mixture_distribution.logits, members.means, members.factor
-    return GaussianMixture(*(part[chosen, row] for part in parts))
+    return GaussianMixture(*(part[chosen, row] for part in members.parts))
 
 
 def autoregressive(noise: Tensor, coefficients: Tensor) -> Tensor:

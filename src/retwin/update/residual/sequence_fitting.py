@@ -11,18 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.checks import require
-from retwin.data.trajectories import Trajectories
 from retwin.nets.mixtures import Blocks
 from retwin.nets.training import Fit, Loss, isolated, train
 from retwin.progress import Progress, part_of
-from retwin.update.corrections import Context, Correction, Discrepancy
-from retwin.update.residual.penalties import (
-    BOUND_MARGIN,
-    SMALLEST,
-    checked_bounds,
-    mean_where,
-    penalties,
-)
+from retwin.update.residual.residual import BOUND_MARGIN, SMALLEST, mean_where
 from retwin.update.residual.sequence import (
     SequenceMixture,
     SequenceResidual,
@@ -30,6 +22,7 @@ from retwin.update.residual.sequence import (
     scale_deviations,
     shrunk,
 )
+from retwin.update.residual.targets import ResidualTask
 
 SPREADS = np.geomspace(0.5, 4.0, 85)
 """Candidates for the factor of the standard deviations, 2.5 % from one to the next."""
@@ -39,37 +32,16 @@ MAX_PERSISTENCE = 0.999
 """Largest persistence; beyond it the correlation time exceeds the length of common records."""
 
 
-def fit_sequence(
-    used: Trajectories,
-    correction: Correction,
-    density: SequenceMixture,
-    context: Context,
-    found: Discrepancy,
-    *,
-    seed: int,
-    bounds: NDArray | None = None,
-    progress: Progress | None = None,
-) -> SequenceResidual:
+def fit_sequence(task: ResidualTask, density: SequenceMixture) -> SequenceResidual:
     """Fit the residual model of measured records, given their discrepancies.
 
     Parameters
     ----------
-    used : Trajectories
-        Measured records, at least one.
-    correction : Correction
-        The operator g.
+    task : ResidualTask
+        Measured records, at least one, and the seed of initial weights, order of windows and
+        dropout.
     density : SequenceMixture
         Settings.
-    context : Context
-        Commands and nominal outputs of the records.
-    found : Discrepancy
-        Their z*.
-    seed : int
-        Seed of initial weights, order of windows and dropout.
-    bounds : NDArray, optional
-        (d_z,), b of Eq. 9; by default 1.25 times the largest |z*|.
-    progress : callable, optional
-        Called with the share of the members that are trained.
 
     Returns
     -------
@@ -85,10 +57,11 @@ def fit_sequence(
         A part of the data has no measurement, or a bound is not positive.
 
     """
+    used, found, seed = task.used, task.found, task.seed
     with isolated(seed):
-        model = SequenceResidual(correction, density, inputs=used.inputs, outputs=used.outputs)
+        model = SequenceResidual(task.correction, density, inputs=used.inputs, outputs=used.outputs)
     identified = found.identified.all(dim=-1)
-    data = _Records(past(context), found.z.float(), identified, torch.as_tensor(used.lengths))
+    data = _Records(past(task.context), found.z.float(), identified, torch.as_tensor(used.lengths))
     valid = torch.arange(used.steps) < data.lengths[:, None]
     held_out = held_out_parts(valid, density)
     require(
@@ -98,20 +71,19 @@ def fit_sequence(
         got=f"{int(identified.sum())} measured samples, some parts with none",
         remedy="give longer records, fewer members, or shorter blocks",
     )
-    _prepare(model, data, bounds, seed)
+    _prepare(model, data, task.bounds, seed)
     fitted = torch.stack([identified & ~_dilate(part, density.margin) for part in held_out])
     rounds = 1 + density.refit
-    fit = _train_members(model, data, fitted, seed, part_of(progress, 0, rounds))
+    fit = _train_members(model, data, fitted, seed, part_of(task.progress, 0, rounds))
     figures = _calibrate(model, data, held_out)
     if density.refit:
         with isolated(seed + 1):
             model.members = model.fresh()
         _initialise(model, data, seed)
         every = identified.expand_as(fitted)
-        fit = _train_members(model, data, every, seed + 1, part_of(progress, 1, rounds))
-    model.emulated = used.emulated
+        fit = _train_members(model, data, every, seed + 1, part_of(task.progress, 1, rounds))
     model.fitted = replace(fit, figures=figures, reason=f"{density.members} members, {fit.reason}")
-    return model.eval()
+    return model
 
 
 def _train_members(
@@ -204,8 +176,7 @@ def _prepare(model: SequenceResidual, data: _Records, bounds: NDArray | None, se
     largest = values.abs().amax(dim=0).clamp_min(SMALLEST)
     model.scale.copy_(values.std(dim=0, correction=0).maximum(1e-6 * largest))
     model.bounds.copy_(BOUND_MARGIN * largest)
-    if bounds is not None:
-        model.bounds.copy_(checked_bounds(bounds, model.latent))
+    model.take_bounds(bounds)
     _initialise(model, data, seed)
 
 
@@ -228,7 +199,7 @@ def _objective(model: SequenceResidual) -> Loss:
         used, distribution = flags.movedim(-1, 0), Blocks(model.predict(features))
         deviation = (distribution.variance.sqrt() / model.scale).detach().mean(dim=-1)
         nll = -distribution.log_prob(z) * deviation ** (2 * density.moderation)
-        return (mean_where(nll, used) + penalties(model, distribution.mean, used)).sum()
+        return (mean_where(nll, used) + model.penalise(distribution.mean, used)).sum()
 
     return loss
 
@@ -245,9 +216,8 @@ def _calibrate(model: SequenceResidual, data: _Records, held_out: Tensor) -> dic
     predicted = shrunk(predicted, model.shift.split(model.sizes), model.trust.split(model.sizes))
 
     def with_spread(spread: float) -> Blocks:
-        return Blocks(
-            scale_deviations(predicted, torch.full_like(model.spread, spread).split(model.sizes))
-        )
+        own = torch.full_like(model.spread, spread).split(model.sizes)
+        return Blocks(scale_deviations(predicted, own))
 
     def log_likelihood(spread: float) -> float:
         return float(with_spread(spread).log_prob(data.z)[held_out].sum())

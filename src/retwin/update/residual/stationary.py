@@ -7,15 +7,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from retwin.checks import require
-from retwin.data.trajectories import Trajectories
 from retwin.nets.mixtures import Blocks, GaussianMixture
 from retwin.nets.training import Fit
-from retwin.update.corrections import Context, Correction, Discrepancy
-from retwin.update.residual.penalties import SMALLEST
-from retwin.update.residual.residual import Residual
+from retwin.update.corrections import Context
+from retwin.update.residual.residual import SMALLEST, Residual
 from retwin.update.residual.sequence import autoregressive
 from retwin.update.residual.sequence_fitting import MAX_PERSISTENCE
+from retwin.update.residual.targets import ResidualTask
 
 
 @dataclass(frozen=True)
@@ -41,20 +39,11 @@ class StationaryResidual(Residual[StationaryNoise]):
     Raises
     ------
     InputError
-        The operator has no z per sample.
+        The operator has no z per sample, or an event among its components.
 
     """
 
     kind = "stationary residual"
-
-    def _check_correction(self) -> None:
-        require(
-            self.correction.resolution == "step",
-            "correction",
-            expected="an operator with one z per sample",
-            got=repr(self.correction),
-            remedy="use Additive",
-        )
 
     def _build(self) -> None:
         self.spread = nn.Buffer(torch.ones(len(self.latent)))
@@ -76,11 +65,10 @@ class StationaryResidual(Residual[StationaryNoise]):
         return self.spread * self.scale * autoregressive(noise, self.persistence)
 
 
-def fit_stationary(
-    used: Trajectories, correction: Correction, density: StationaryNoise, found: Discrepancy
-) -> StationaryResidual:
+def fit_stationary(task: ResidualTask, density: StationaryNoise) -> StationaryResidual:
     """The noise of measured records, given their discrepancies; it is not random."""
-    model = StationaryResidual(correction, density, inputs=used.inputs, outputs=used.outputs)
+    used, found = task.used, task.found
+    model = StationaryResidual(task.correction, density, inputs=used.inputs, outputs=used.outputs)
     seen, z = found.identified, torch.where(found.identified, found.z, 0.0).double()
     power = z.square().sum(dim=(0, 1)) / seen.sum(dim=(0, 1)).clamp_min(1)
     both = seen[:, 1:] & seen[:, :-1]
@@ -90,8 +78,7 @@ def fit_stationary(
     model.scale.copy_(power.sqrt().clamp_min(SMALLEST))
     model.persistence.copy_(persistence.clamp(0.0, MAX_PERSISTENCE))
     model.bounds.fill_(torch.inf)
-    model.emulated = used.emulated
     pairs = zip(model.latent.names, power.sqrt().tolist(), strict=True)
     figures = {f"rmse_{name}": value for name, value in pairs} | {"samples": float(seen.sum())}
     model.fitted = Fit(figures, {}, 0, "errors of the twin as noise")
-    return model.eval()
+    return model

@@ -5,15 +5,44 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from retwin.data.trajectories import Trajectories
 from retwin.nets.mixtures import BernoulliHead
-from retwin.update.corrections import Context, Discrepancy
+from retwin.progress import Progress
+from retwin.update.corrections import Context, Correction, Discrepancy
 from retwin.update.residual.model import ResidualModel, describe
 
 DRAWS = 20
 """Draws of z per trajectory from its posterior. They represent the uncertainty that outputs leave;
 with twenty the error of a mean is below a quarter of a standard deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualTask:
+    """What a residual model is fitted to, and how; see the arguments of `fit_residual`.
+
+    Attributes
+    ----------
+    used : Trajectories
+        The n measured trajectories.
+    correction : Correction
+        The operator g, whose settings have been fitted to them.
+    context : Context
+        What g is applied to.
+    found : Discrepancy
+        Their z*.
+
+    """
+
+    used: Trajectories
+    correction: Correction
+    context: Context
+    found: Discrepancy
+    bounds: NDArray | None
+    seed: int
+    progress: Progress | None
 
 
 @dataclass(frozen=True, eq=False)

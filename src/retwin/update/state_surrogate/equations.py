@@ -17,7 +17,7 @@ networks", European Control Conference (2021), for that of the network.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -26,10 +26,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retwin.data.trajectories import Channels, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.limits import Limits
+from retwin.twins.twin import Twin
 from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.dynamics.unknowns import coefficients_of
 
@@ -146,63 +147,43 @@ class Equations:
         """The same equations with other weights (k,)."""
         return replace(self, arrays=self.at(flat))
 
-    def trainable(
-        self, inputs: Channels, outputs: Channels, rate: float, states: Sequence[State] = ()
-    ) -> StateTwin:
+    def trainable(self, made: Trajectories, states: Sequence[State] = ()) -> StateTwin:
         """The equations whose parameters are the weights, and whose inputs are v.
 
-        Without `states`, all trajectories begin at 0.
+        Channels and rate are those of trajectories. Without `states`, all of them begin at 0.
         """
         names = [f"{name}{i + 1}" for name, each in self.arrays.items() for i in range(each.size)]
-
-        def next_state(x: Any, u: Any, p: Any) -> Any:
-            return self._next(list(x), list(u), self.at(torch.stack(list(p))))
-
-        def output(x: Any, u: Any, p: Any) -> Any:
-            return self._output(list(x), list(u), self.at(torch.stack(list(p))))
-
-        return StateTwin(
-            states or self._states(),
-            output,
-            inputs,
-            outputs,
-            rate,
-            step=next_state,
-            parameters=coefficients_of(names, self.flat),
-        )
+        weights = coefficients_of(names, self.flat)
+        step, output = self._make_functions(lambda u, p: ([*u], self.at(torch.stack([*p]))))
+        states, channels = states or self._states(), (made.inputs, made.outputs, made.rate)
+        return StateTwin(states, output, *channels, step=step, parameters=weights)
 
     def twin(
-        self,
-        inputs: Channels,
-        outputs: Channels,
-        rate: float,
-        parameters: Sequence[Parameter],
-        limits: Limits,
-        starts: NDArray | None,
+        self, like: Twin, parameters: Sequence[Parameter], limits: Limits, starts: NDArray | None
     ) -> StateTwin:
-        """The equations with constant weights, whose parameters are those of the twin.
+        """The equations with constant weights, whose parameters are those of the twin `like`.
 
         `starts` (2, d_x) are the bounds of the states at the first sample, where it is unknown.
         """
         constant = {name: torch.tensor(each) for name, each in self.arrays.items()}
+        step, output = self._make_functions(lambda u, p: ([*u, *p], constant))
+        return StateTwin(
+            self._states(starts), output, like.inputs, like.outputs, like.rate,
+            step=step, parameters=parameters, limits=limits, learned=True,
+        )  # fmt: skip
 
-        def next_state(x: Any, u: Any, p: Any) -> Any:
-            return self._next(list(x), [*u, *p], constant)
+    def _make_functions(
+        self, given: Callable[[Any, Any], tuple[list[Any], dict[str, Any]]]
+    ) -> tuple[Callable[..., Any], Callable[..., Any]]:
+        """The step and the output of a `StateTwin`; `given` makes v and weights of its u and p."""
+
+        def step(x: Any, u: Any, p: Any) -> Any:
+            return self._next([*x], *given(u, p))
 
         def output(x: Any, u: Any, p: Any) -> Any:
-            return self._output(list(x), [*u, *p], constant)
+            return self._output([*x], *given(u, p))
 
-        return StateTwin(
-            self._states(starts),
-            output,
-            inputs,
-            outputs,
-            rate,
-            step=next_state,
-            parameters=parameters,
-            limits=limits,
-            learned=True,
-        )
+        return step, output
 
     def _states(self, starts: NDArray | None = None) -> list[State]:
         count = len(self.speed)
@@ -256,10 +237,8 @@ def _linear(v: NDArray, y: NDArray, order: int) -> Linear:
     states = directions[:, :order].reshape(len(v), count, -1) * np.sqrt(len(predicted))
     states = np.pad(states, ((0, 0), (0, 0), (0, order - states.shape[2])))
     now = np.concatenate([states, window(v, [lags]), one], axis=2)
-    flow, read = (
-        np.linalg.lstsq(rows(columns), rows(target), rcond=DISTINCT)[0].T
-        for columns, target in ((now[:, :-1], states[:, 1:]), (now, window(y, [lags])))
-    )
+    pairs = (now[:, :-1], states[:, 1:]), (now, window(y, [lags]))
+    flow, read = (np.linalg.lstsq(rows(a), rows(b), rcond=DISTINCT)[0].T for a, b in pairs)
     parts = [(each[:, :order], each[:, order:-1], each[:, -1]) for each in (flow, read)]
     (a, b, c), (out, direct, e) = parts
     modulus = float(np.abs(np.linalg.eigvals(a)).max())

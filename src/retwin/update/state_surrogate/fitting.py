@@ -126,14 +126,8 @@ class FittedStateSurrogate:
 
     def save(self, folder: str | Path) -> None:
         """Write the equations and the figures; no code of the twin is needed to read them."""
-        about = {
-            "equations": equations_of(self.twin),
-            "figures": self.figures,
-            "history": {str(order): error for order, error in self.history.items()},
-            "seconds": self.seconds,
-            "reason": self.reason,
-        }
-        save_model(folder, KIND, about, {})
+        about = {name: each for name, each in vars(self).items() if name != "twin"}
+        save_model(folder, KIND, {"equations": equations_of(self.twin), **about}, {})
 
     @classmethod
     def load(cls, folder: str | Path) -> FittedStateSurrogate:
@@ -261,7 +255,7 @@ def _twin_of(
     limits = Limits(floats(low), floats(high), "refuse" if limits is None else limits.outside)
 
     def made(starts: NDArray | None) -> StateTwin:
-        return found.equations.twin(twin.inputs, twin.outputs, twin.rate, free, limits, starts)
+        return found.equations.twin(twin, free, limits, starts)
 
     known = made(None)
     if not unknown_start:
@@ -310,12 +304,7 @@ def _test(
         "StateTwin (docs/twins.md#states), or correct the outputs of the twin as it is, without "
         "dynamics",
     )
-    columns = {
-        "rmse": whole * deviation,
-        "nrmse": whole,
-        "nrmse_first": first,
-        "nrmse_last": last,
-    }
+    columns = {"rmse": whole * deviation, "nrmse": whole, "nrmse_first": first, "nrmse_last": last}
     return {
         f"{figure}_{name}": float(each)
         for figure, row in columns.items()

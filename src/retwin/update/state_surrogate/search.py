@@ -180,7 +180,7 @@ class StateSearch:
 
         It ends where the error of held-out simulations is `enough`.
         """
-        twin = equations.trainable(training.inputs, training.outputs, training.rate)
+        twin = equations.trainable(training)
         starts = dict.fromkeys((f"start_{each.name}" for each in twin.states), 0.0)
         weights = dict(zip(twin.names, equations.flat, strict=False))
         unknowns = unknowns_of(twin, twin.parameters, starts | weights)
@@ -217,7 +217,7 @@ def _error_of(equations: Equations, made: Trajectories, twin: StateTwin | None =
 
     Its present weights do not matter.
     """
-    twin = twin or equations.trainable(made.inputs, made.outputs, made.rate)
+    twin = twin or equations.trainable(made)
     theta = np.tile(np.append(equations.flat, np.zeros(len(twin.states))), (len(made), 1))
     simulated = twin.steps().run(made.commands.astype(np.float64), theta)[0]
     deviation = equations.outputs.deviation

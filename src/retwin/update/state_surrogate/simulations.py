@@ -51,14 +51,8 @@ def samplers_of(
     own: list[NDArray] = []
     if hasattr(commands, "sample"):
         sampler: Any = commands
-        agree(
-            "commands",
-            sampler,
-            twin,
-            "that of the twin",
-            names=("rate",),
-            remedy="give both the same rate",
-        )
+        remedy = "give both the same rate"
+        agree("commands", sampler, twin, "that of the twin", names=("rate",), remedy=remedy)
         samplers.append(sampler)
     else:
         own.append(checked_commands(commands, twin.inputs).astype(np.float64))

@@ -9,6 +9,7 @@ segment altogether: it stays where it is and catches up with the next command.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -52,27 +53,18 @@ class CommandSpace:
 
     """
 
+    resolution: ClassVar[str] = "segment"
+    """One z per segment."""
+    pools: ClassVar[bool] = True
+    """`infer` learns its priors from all trajectories together."""
+    severities: ClassVar[bool] = True
+    """`infer` estimates the severity of a known fault apart from z."""
     delay_range: tuple[float, float] | None = None
     max_samples: int = 200
     identified_below: float = 0.7
 
     def __post_init__(self) -> None:
         checked_range(self.delay_range)
-
-    @property
-    def resolution(self) -> str:
-        """One z per segment."""
-        return "segment"
-
-    @property
-    def pools(self) -> bool:
-        """`infer` learns its priors from all trajectories together."""
-        return True
-
-    @property
-    def severities(self) -> bool:
-        """`infer` estimates the severity of a known fault apart from z."""
-        return True
 
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """`delay` in samples, `offset_…` in the commands' units, `missed_…` 0 or 1."""
@@ -81,11 +73,8 @@ class CommandSpace:
 
     def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
         """A mixture for the delay, one for all offsets together, and missed segments."""
-        return (
-            Head("delay", 1),
-            Head("offset", len(inputs)),
-            Head("missed", len(inputs), "bernoulli"),
-        )
+        width = len(inputs)
+        return Head("delay", 1), Head("offset", width), Head("missed", width, "bernoulli")
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """ỹ = G_φ(T_z(u)), differentiable in z; a frozen actuator stays where z had brought it."""
@@ -97,12 +86,10 @@ class CommandSpace:
         """The same (n, S, d_y) at the samples `when` (n, S) only."""
         if not getattr(context.surrogate, "memoryless", False):
             return gather_samples(self.apply(context, z), when)
-        made = at_effective_commands(
-            context.surrogate, context.faulty_commands, context.segments, z, when, context.frozen
-        )
-        if made is not None:
-            return made
-        return outputs_at(context.surrogate, _commands(context, z, when))
+        made = at_effective_commands(context, z, when)
+        if made is None:
+            made = outputs_at(context.surrogate, _commands(context, z, when))
+        return made
 
     def completed(self, context: Context, observed: Tensor, mask: Tensor) -> CommandSpace:
         """The operator with the range of delays that measured outputs show, where none is given."""
@@ -129,8 +116,6 @@ class CommandSpace:
 
 def _commands(context: Context, z: Tensor, times: Tensor) -> Tensor:
     """T_z(u) at `times`, (n, S) or (S,), in the precision of the commands."""
-    reference = context.faulty_commands
-    effective = effective_commands(
-        reference.to(z.dtype), context.segments, z, times, context.frozen
-    )
-    return effective.to(reference.dtype)
+    given = context.faulty_commands
+    made = effective_commands(given.to(z.dtype), context.segments, z, times, context.frozen)
+    return made.to(given.dtype)

@@ -50,7 +50,16 @@ def effective_commands(
     """
     times = times.to(z.dtype).expand(len(z), -1)
     if own_delays is not None:
-        return _one_by_one(reference, segments, z, times, frozen, own_delays)
+        # No actuator's command depends on another's: each is computed as a system of one actuator.
+        width = own_delays.shape[-1]
+        delay, offset, missed = z.split([1, width, width], dim=-1)
+        parts = torch.stack([delay + own_delays, offset, missed], dim=-1)
+        columns = []
+        for i, one in ((i, slice(i, i + 1)) for i in range(width)):
+            held = None if frozen is None else frozen[:, one]
+            given = reference[..., one], segments, parts[:, :, i], times, held
+            columns.append(effective_commands(*given))
+        return torch.cat(columns, dim=-1)
     if frozen is None:
         return _moving(reference, segments, z, times)
     made = effective_commands_at(reference, segments, z, times, frozen)
@@ -100,32 +109,6 @@ def command_jacobians(
     commands = executed((x[:, None] + moves).flatten(0, 1), rows).unflatten(0, (n, len(moves)))
     delay, offset = ((commands[:, 1:] - commands[:, :1]) / step).split(segments, dim=1)
     return commands[:, 0], delay, offset
-
-
-def _one_by_one(
-    reference: Tensor,
-    segments: Segments,
-    z: Tensor,
-    times: Tensor,
-    frozen: Tensor | None,
-    own_delays: Tensor,
-) -> Tensor:
-    """The effective commands if every actuator has delays of its own.
-
-    No actuator's command depends on another's: each is computed as a system of one actuator.
-    """
-    width = own_delays.shape[-1]
-    delay, offset, missed = z.split([1, width, width], dim=-1)
-    columns = []
-    for one in (slice(i, i + 1) for i in range(width)):
-        parts = delay + own_delays[..., one], offset[..., one], missed[..., one]
-        since = None if frozen is None else frozen[:, one]
-        columns.append(
-            effective_commands(
-                reference[..., one], segments, torch.cat(parts, dim=-1), times, since
-            )
-        )
-    return torch.cat(columns, dim=-1)
 
 
 def _moving(reference: Tensor, segments: Segments, z: Tensor, times: Tensor) -> Tensor:

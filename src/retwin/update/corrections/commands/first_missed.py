@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from retwin.update.corrections.commands.problem import CommandProblem
-from retwin.update.corrections.warp import within
 
 
 @torch.no_grad()
@@ -32,7 +31,8 @@ def first_missed(problem: CommandProblem, deviation: Tensor, odds: float) -> Ten
         Log odds that an actuator misses a segment.
 
     """
-    missed, rest = problem.missed.clone(), _rest(problem)
+    missed, margin = problem.missed.clone(), max(problem.delay_range[1], 0.0)
+    rest = problem.at_rest(margin) & (problem.measured > 0)[:, None]
     if not rest.any():
         return missed
     precision = _precision(problem, rest, deviation)
@@ -65,22 +65,9 @@ def first_missed(problem: CommandProblem, deviation: Tensor, odds: float) -> Ten
 
 def _flipped(missed: Tensor, healthy: Tensor, m: int) -> list[Tensor]:
     """Missed segments (k, M, d_u) with other ones in segment `m`, where actuators are healthy."""
-    made = []
-    for change in torch.eye(missed.shape[2], dtype=missed.dtype):
-        flipped = missed.clone()
-        flipped[:, m] = (missed[:, m] - change * healthy).abs()
-        made.append(flipped)
-    whole = missed.clone()
-    whole[:, m] = healthy.to(missed)
-    return [*made, whole]
-
-
-def _rest(problem: CommandProblem) -> Tensor:
-    """(n, M, S) bool, samples at rest after a segment; of a short rest its second half."""
-    settle, stop = (torch.as_tensor(getattr(problem.segments, each)) for each in ("settle", "stop"))
-    margin = torch.full_like(settle, max(problem.delay_range[1], 0.0))
-    begin = settle + margin.minimum((stop - settle) / 2)
-    return within(problem.sample, begin, stop.ceil() - 1) & (problem.measured > 0)[:, None]
+    changes = torch.eye(missed.shape[2], dtype=missed.dtype)
+    tried = [*((missed[:, m] - each * healthy).abs() for each in changes), healthy.to(missed)]
+    return [missed.index_copy(1, torch.tensor([m]), each[:, None]) for each in tried]
 
 
 def _precision(problem: CommandProblem, rest: Tensor, deviation: Tensor) -> Tensor:

@@ -44,10 +44,8 @@ def regression_predicts_better(
     order = np.random.default_rng(0).permutation(len(shown))
     folds = [torch.isin(index, shown[order[k::FOLDS]]) for k in range(min(FOLDS, len(shown)))]
     masks = [(each & problem.valid)[..., None].expand(*each.shape, problem.size) for each in folds]
-    constant, regression = (
-        _density(replace(features, regression=each), hierarchy, problem, likelihood, masks)
-        for each in (False, True)
-    )
+    both = (replace(features, regression=each) for each in (False, True))
+    constant, regression = (_density(e, hierarchy, problem, likelihood, masks) for e in both)
     gain = regression - constant
     # A gain that is within its standard error is none.
     return bool(gain.sum() > len(gain) ** 0.5 * gain.std())

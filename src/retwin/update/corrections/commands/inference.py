@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from retwin.checks import require
-from retwin.inference.em import expectation_maximisation
 from retwin.inference.hierarchy import CONDITION, Design, Hierarchy, Likelihood, normal
 from retwin.inference.hyperprior import Hyperprior
 from retwin.inference.noise import Noise
@@ -120,22 +119,18 @@ def infer_commands(
         white, prior, noise = given.whitened(problem), given.prior(problem), given.noise
         return searched(white, prior, noise, found.fit, partial(_suspects, white, prior, noise))
 
-    def learn(found: MissedSearch, given: Hyperparameters) -> Hyperparameters:
-        return given.learned(problem.with_missed(found.fit.missed), found.fit.solution, weight)
-
     fit = CommandFit.of_prior(problem, first.prior(problem), start)
     found, learned = MissedSearch(fit, fit.missed, fit.evidence), first
     for regression in (False, True):
         if regression and not learned.explained(problem, found.fit, weight):
             break
-        found, learned = expectation_maximisation(
-            found,
-            learned.with_regression(problem, regression),
-            infer=infer,
-            learn=learn,
-            rounds=MAX_ROUNDS,
-            converged=Hyperparameters.near,
-        )
+        learned = learned.with_regression(problem, regression)
+        for _ in range(MAX_ROUNDS):
+            found, before = infer(found, learned), learned
+            missed, solution = found.fit.missed, found.fit.solution
+            learned = before.learned(problem.with_missed(missed), solution, weight)
+            if learned.near(before):
+                break
     certain = None
     if uncertain.common is not None:
         certain = learned.linearised(problem, found.fit).weighted(weight)
@@ -317,13 +312,12 @@ class Hyperparameters:
         samples = self.samples.learned(white, self.noise, x)
         white = replace(white, whitening=samples.whitening())
         likelihood = Likelihood.of(solution, self.hierarchy.prior(design)).weighted(weight)
-        return Hyperparameters(
-            self.features,
-            self.hierarchy.learned(design, likelihood),
-            _odds(problem, self.missed),
-            samples,
-            self._noise(white, solution),
-            self.missed,
+        return replace(
+            self,
+            hierarchy=self.hierarchy.learned(design, likelihood),
+            odds=_odds(problem, self.missed),
+            samples=samples,
+            noise=self._noise(white, solution),
         )
 
     def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
@@ -368,12 +362,10 @@ def _discrepancy(
     prior = hyperparameters.prior(problem).gaussian
     common = _common(problem)
     found, covariance = posterior
-    x, mean = (
-        (common @ problem.per_segment(each)[..., None])[..., 0] for each in (found, prior.mean)
-    )
-    inner, wide = (
-        common @ blocks(each, segments) @ common.mT for each in (covariance, prior.covariance)
-    )
+    both = (problem.per_segment(each)[..., None] for each in (found, prior.mean))
+    x, mean = ((common @ each)[..., 0] for each in both)
+    parts = (blocks(each, segments) for each in (covariance, prior.covariance))
+    inner, wide = (common @ each @ common.mT for each in parts)
     x[..., 0].clamp_(*problem.delay_range)
     left, wide = inner.diagonal(dim1=-2, dim2=-1), wide.diagonal(dim1=-2, dim2=-1)
     severity = torch.where(problem.faulty, (x - mean)[..., 1:], 0.0)

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from retwin.inference.evidence import added_evidence, best_per_row
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
-from retwin.inference.solver import Solution, solve
+from retwin.inference.problem import Rows
+from retwin.inference.solver import Solution, added_evidence, best_per_row, solve
 from retwin.update.corrections.commands.problem import CommandProblem
 
 SEARCHES = 3
@@ -28,7 +28,7 @@ Suspects = Callable[["CommandFit", Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
 @dataclass(frozen=True, eq=False)
-class LatentPrior:
+class LatentPrior(Rows):
     """The distribution of (x, missed) before any output is measured.
 
     Attributes
@@ -42,10 +42,6 @@ class LatentPrior:
 
     gaussian: GaussianPrior
     odds: Tensor
-
-    def __getitem__(self, rows: Tensor) -> LatentPrior:
-        """The prior of some rows."""
-        return LatentPrior(self.gaussian[rows], self.odds[rows])
 
     @property
     def deviation(self) -> Tensor:
@@ -66,7 +62,7 @@ class LatentPrior:
 
 
 @dataclass(frozen=True, eq=False)
-class CommandFit:
+class CommandFit(Rows):
     """The most probable x of every row.
 
     Attributes
@@ -94,18 +90,6 @@ class CommandFit:
     def x(self) -> Tensor:
         """(R, P)."""
         return self.solution.x
-
-    def __getitem__(self, rows: Tensor) -> CommandFit:
-        """The fit of some rows."""
-        return CommandFit(self.solution[rows], self.missed[rows], self.evidence[rows])
-
-    def put(self, rows: Tensor, other: CommandFit) -> CommandFit:
-        """The same with another fit in some rows."""
-        return CommandFit(
-            self.solution.put(rows, other.solution),
-            self.missed.index_copy(0, rows, other.missed),
-            self.evidence.index_copy(0, rows, other.evidence),
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,9 +72,8 @@ class OffsetFeatures:
         """
         first, last = (each[problem.valid] for each in problem.levels)
         centre = last.mean(dim=0)
-        spread, travel = (
-            each.square().mean(dim=0).sqrt() for each in (last - centre, last - first)
-        )
+        apart = (last - centre, last - first)
+        spread, travel = (each.square().mean(dim=0).sqrt() for each in apart)
         smallest = STILL * problem.reference.abs().amax(dim=(0, 1))
         travel = torch.where(travel <= smallest, 1.0, travel)
         spread = torch.where(spread <= smallest, travel, spread)
@@ -84,10 +83,8 @@ class OffsetFeatures:
 
     def conditions(self, problem: CommandProblem) -> Tensor:
         """(n, M, 2 d_u), commands before and after each segment, in multiples of what is equal."""
-        first, last = (
-            ((each - self.centre) / (EQUAL * self.spread)).round() for each in problem.levels
-        )
-        return torch.cat([first, last], dim=-1)
+        scaled = [(each - self.centre) / (EQUAL * self.spread) for each in problem.levels]
+        return torch.cat(scaled, dim=-1).round()
 
     def replicates(self, problem: CommandProblem) -> Tensor:
         """(n, M), the number of segments of the same condition."""
@@ -121,9 +118,8 @@ class OffsetFeatures:
         used = torch.zeros_like(wider)
         used[:, :, 0] = problem.valid
         used[:, :, 1 : 1 + width] = moved
-        used[:, :, 1 + width :] = (moved & (self._direction(problem) != 0)).repeat(
-            1, 1, int(problem.own_delays)
-        )
+        if problem.own_delays:
+            used[:, :, 1 + width :] = moved & (self._direction(problem) != 0)
         actuators = torch.arange(1, 1 + width)
         zero, last = torch.tensor([0]), torch.tensor([1 + width])
         group = torch.cat([zero, actuators, last.expand(problem.size - 1 - width)])

@@ -13,7 +13,7 @@ from retwin.data.segments import Segments
 from retwin.inference.losses import Tukey
 from retwin.inference.noise import Noise, common_rounding, correlation_time
 from retwin.inference.solver import Bounds
-from retwin.update.corrections.delays import delay_bounds
+from retwin.update.corrections.delays import DelayProblem, delay_bounds
 from retwin.update.corrections.sampled_sensor import lattice_step
 from retwin.update.corrections.warp import Knots, interpolate, within
 
@@ -27,8 +27,6 @@ MAX_CORRELATION = 0.999
 """Largest lag-one autocorrelation of residuals: slow drift makes nearly all samples one."""
 SINGLE = torch.finfo(torch.float32).eps
 """Relative distance of neighbouring numbers in single precision."""
-COMMON = ("delay_range", "rounding")
-"""Fields of `PathProblem` that all trajectories share."""
 
 
 def path_at(segments: Segments, path: Tensor, z: Tensor) -> Tensor:
@@ -38,7 +36,7 @@ def path_at(segments: Segments, path: Tensor, z: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class PathProblem:
+class PathProblem(DelayProblem):
     """Residual and Jacobian for x = (delay, offsets) of every segment.
 
     The engine's rows are trajectories, its latent variables x (n, P), P = M (1 + d_y). Samples at
@@ -50,37 +48,24 @@ class PathProblem:
     ----------
     common : None
         The surrogate's error, which the path contains, is added to the covariance of z.
-    segments : Segments
-        M at most.
     path : Tensor
-        (n, T, d_y), uncorrected.
-    observed : Tensor
-        (n, T, d_y), in the same unit.
+        (n, T, d_y), uncorrected; `observed` is in the same unit, and every `sample` (T,) is used.
     available : Tensor
-        (n, T, d_y) bool, which outputs were measured.
-    measured : Tensor
-        (n, T), share of a sample's outputs that was measured.
+        (n, T, d_y) bool, which outputs were measured; `measured` (n, T) is the share of a sample's
+        outputs that was.
     factor : Tensor
         (n, T, d_y), what residuals are multiplied by; 0 where nothing was measured.
-    group : Tensor
-        (n, T) long.
-    delay_range : tuple of float
-        Smallest and largest delay, in samples.
     rounding : float
         Standard deviation of the error of a sample by rounding, of all outputs together.
 
     """
 
-    segments: Segments
     path: Tensor
-    observed: Tensor
     available: Tensor
-    measured: Tensor
     factor: Tensor
-    group: Tensor
-    delay_range: tuple[float, float]
-    rounding: float = 0.0
+    rounding: float
     common: ClassVar[None] = None
+    shared = ("sample", "delay_range", "rounding")
 
     @classmethod
     def of(
@@ -99,47 +84,30 @@ class PathProblem:
         observed = torch.where(available, observed, 0.0)
         # Paths are computed in single precision, whose rounding is the same at rest too.
         single = SINGLE * path.abs().amax(dim=(0, 1))
+        columns = observed.flatten(0, 1).T, available.flatten(0, 1).T, single
         steps = [
             max(lattice_step(each[seen].numpy()), float(least))
-            for each, seen, least in zip(
-                observed.flatten(0, 1).T, available.flatten(0, 1).T, single, strict=True
-            )
+            for each, seen, least in zip(*columns, strict=True)
         ]
         rounding = math.hypot(*steps) / math.sqrt(12)
-        return cls(
-            segments, path, observed, available, measured, factor, group, delay_range, rounding
-        )
+        sample, given = torch.arange(segments.steps, dtype=torch.float64), (path, available)
+        common = segments, sample, measured, group, observed, delay_range
+        return cls(*common, *given, factor, rounding)
 
     def with_motion(self, delay: Tensor) -> PathProblem:
         """The same with motion where segments delayed by (n, M) samples are under way."""
-        start, settle, valid = (
-            torch.as_tensor(getattr(self.segments, name)) for name in ("start", "settle", "valid")
-        )
+        start, settle = map(torch.as_tensor, (self.segments.start, self.segments.settle))
+        valid = torch.as_tensor(self.segments.valid)
         before, after = (self.width * each for each in AROUND)
         inside = within(self.sample, start + delay - before, settle + delay + after)
         moving = (inside & valid[..., None]).any(dim=1)
         return replace(self, group=2 * (self.group // 2) + moving)
-
-    def __getitem__(self, rows: Tensor) -> PathProblem:
-        """The problem of some trajectories."""
-        parts = {name: each[rows] for name, each in vars(self).items() if name not in COMMON}
-        return replace(self, **parts)
-
-    @property
-    def width(self) -> float:
-        """Of the range of delays, in samples."""
-        return self.delay_range[1] - self.delay_range[0]
 
     @property
     def bounds(self) -> Bounds:
         """The range of delays, and the largest step, as limits of x."""
         step = MAX_STEP * self.width
         return delay_bounds(self.segments, 1 + self.path.shape[2], self.delay_range, step)
-
-    @property
-    def sample(self) -> Tensor:
-        """All samples (T,)."""
-        return torch.arange(self.segments.steps, dtype=torch.float64)
 
     @property
     def motion_measured(self) -> Tensor:
@@ -149,21 +117,14 @@ class PathProblem:
         """
         start, settle, stop = self.segments.start, self.segments.settle, self.segments.stop
         seen = self.available.any(dim=-1)[:, None]
-        motion, whole = (
-            (inside * seen).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
-            for inside in (within(self.sample, start, end) for end in (settle, stop))
-        )
+        parts = [within(self.sample, start, end) for end in (settle, stop)]
+        motion, whole = ((e * seen).sum(dim=-1) / e.sum(dim=-1).clamp_min(1) for e in parts)
         return motion / whole.amax(dim=1, keepdim=True).clamp_min(1e-9)
-
-    def per_segment(self, x: Tensor) -> Tensor:
-        """Values (n, P) by segment, (n, M, 1 + d_y)."""
-        return x.unflatten(1, (self.segments.max_count, -1))
 
     def residual(self, x: Tensor) -> Tensor:
         """Measured minus corrected path (n, T, d_y), 0 where nothing was measured."""
-        return self.factor * (
-            self.observed - path_at(self.segments, self.path, self.per_segment(x))
-        )
+        corrected = path_at(self.segments, self.path, self.per_segment(x))
+        return self.factor * (self.observed - corrected)
 
     def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual, and the Jacobian (n, T, d_y, P) of the corrected path."""
@@ -193,10 +154,7 @@ class PathProblem:
 
         Of a short rest its second half is used.
         """
-        settle, stop = torch.as_tensor(self.segments.settle), torch.as_tensor(self.segments.stop)
-        begin = settle + torch.minimum(torch.full_like(settle, margin), (stop - settle) / 2)
-        inside = within(self.sample, begin, stop.ceil() - 1)
-        there = inside[..., None] & self.available[:, None]
+        there = self.at_rest(margin)[..., None] & self.available[:, None]
         values = torch.where(there, (self.observed - self.path)[:, None], torch.nan)
         return torch.nan_to_num(torch.nanmedian(values, dim=2).values)
 
@@ -222,6 +180,5 @@ class PathProblem:
         common = common_rounding(scales[1].square(), self.rounding**2) / rest.square()
         same = common * (self.measured * ~moving).sum(dim=1)
         segments = torch.as_tensor(self.segments.valid).sum(dim=1).clamp_min(1)
-        return replace(
-            noise, thinning=torch.stack([time.maximum(same / segments), time], dim=1).flatten()
-        )
+        thinning = torch.stack([time.maximum(same / segments), time], dim=1).flatten()
+        return replace(noise, thinning=thinning)

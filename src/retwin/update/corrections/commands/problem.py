@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from retwin.data.segments import Segments
 from retwin.inference.noise import Noise
 from retwin.inference.problem import CommonError
 from retwin.inference.solver import Bounds
@@ -18,7 +17,7 @@ from retwin.update.corrections.commands.effective_commands import (
     effective_commands,
 )
 from retwin.update.corrections.correction import Context, DifferentiableTwin
-from retwin.update.corrections.delays import delay_bounds
+from retwin.update.corrections.delays import DelayProblem, delay_bounds
 from retwin.update.corrections.sampled_sensor import lattice_step
 from retwin.update.corrections.surrogate_slopes import differences, outputs_at, slopes_at
 from retwin.update.corrections.warp import gather_samples, interpolate, thinned, within
@@ -47,12 +46,10 @@ GAIN_STEP = 5e-3
 """Step of the finite differences of the gain, in standard deviations of a command."""
 TRAJECTORIES_PER_BATCH = 64
 """Trajectories linearised together, which bounds memory."""
-COMMON = ("surrogate", "unit", "rounding", "delay_range", "own_delays")
-"""Fields of `CommandProblem` that all trajectories share."""
 
 
 @dataclass(frozen=True, eq=False)
-class CommandProblem:
+class CommandProblem(DelayProblem):
     """Residual and Jacobian for x = (delay, offsets) of every segment, given what was missed.
 
     The engine's rows are trajectories, its latent variables x (n, P), P = M (1 + d_u). With
@@ -60,14 +57,6 @@ class CommandProblem:
 
     Attributes
     ----------
-    surrogate : DifferentiableTwin
-        Commands to outputs.
-    segments : Segments
-        M at most.
-    reference : Tensor
-        (n, T, d_u), the commands that were sent, faults on them included.
-    frozen : Tensor
-        (n, d_u), the sample from which a fault holds an actuator, T for never.
     sample : Tensor
         (n, S), the samples used of each trajectory, in order. A trajectory that has fewer than S
         repeats its last one.
@@ -79,6 +68,12 @@ class CommandProblem:
         rest.
     observed : Tensor
         (n, S, d_y), in `unit`.
+    surrogate : DifferentiableTwin
+        Commands to outputs.
+    reference : Tensor
+        (n, T, d_u), the commands that were sent, faults on them included.
+    frozen : Tensor
+        (n, d_u), the sample from which a fault holds an actuator, T for never.
     unit : Tensor
         (d_y,), the unit of the residual in that of the outputs.
     rounding : Tensor
@@ -92,8 +87,6 @@ class CommandProblem:
         fault's severity, about which the prior is nearly flat.
     missed : Tensor
         (n, M, d_u), 1 where an actuator missed a segment.
-    delay_range : tuple of float
-        Smallest and largest delay, in samples.
     whitening : Tensor, optional
         (n, S, d_y, d_y), the factor by which residuals and Jacobians are multiplied, so that the
         errors of a sample's outputs are independent and of one size.
@@ -106,23 +99,18 @@ class CommandProblem:
     """
 
     surrogate: DifferentiableTwin
-    segments: Segments
     reference: Tensor
     frozen: Tensor
-    sample: Tensor
-    measured: Tensor
-    group: Tensor
-    observed: Tensor
     unit: Tensor
     rounding: Tensor
     valid: Tensor
     healthy: Tensor
     faulty: Tensor
     missed: Tensor
-    delay_range: tuple[float, float]
     whitening: Tensor | None = None
     own_delays: bool = False
     common: CommonError | None = None
+    shared = ("surrogate", "unit", "rounding", "delay_range", "own_delays")
 
     @classmethod
     def of(
@@ -179,16 +167,6 @@ class CommandProblem:
     def __len__(self) -> int:
         return len(self.reference)
 
-    def __getitem__(self, rows: Tensor) -> CommandProblem:
-        """The problem of some trajectories."""
-        own = {each.name: getattr(self, each.name) for each in fields(self)}
-        parts = {
-            name: value[rows]
-            for name, value in own.items()
-            if name not in COMMON and value is not None
-        }
-        return replace(self, **parts)
-
     def counted_once(self, replicates: Tensor) -> CommandProblem:
         """The same where all replicates of a segment, (n, M) in number, err alike.
 
@@ -211,10 +189,8 @@ class CommandProblem:
     def held_from(self, frozen: Tensor) -> CommandProblem:
         """The same if faults hold the actuators from other samples (n, d_u) on."""
         start = torch.as_tensor(self.segments.start)[..., None]
-        frozen = frozen.double()
-        return replace(
-            self, frozen=frozen, healthy=self.valid[..., None] & (start < frozen[:, None])
-        )
+        healthy = self.valid[..., None] & (start < frozen[:, None])
+        return replace(self, frozen=frozen.double(), healthy=healthy)
 
     @property
     def where_certain(self) -> CommandProblem:
@@ -247,18 +223,9 @@ class CommandProblem:
         return 1 + (1 + self.own_delays) * self.missed.shape[2]
 
     @property
-    def width(self) -> float:
-        """Of the range of delays, in samples."""
-        return self.delay_range[1] - self.delay_range[0]
-
-    @property
     def bounds(self) -> Bounds:
         """The range of delays as limits of x."""
         return delay_bounds(self.segments, self.size, self.delay_range)
-
-    def per_segment(self, x: Tensor) -> Tensor:
-        """Values (n, P) or (n, P, …) by segment, (n, M, P / M, …)."""
-        return x.unflatten(1, (self.missed.shape[1], -1))
 
     def learned_noise(
         self, noise: Noise, residual: Tensor, variance: Tensor | float = 0.0, floor: float = 1e-18
@@ -309,10 +276,8 @@ class CommandProblem:
     @property
     def levels(self) -> tuple[Tensor, Tensor]:
         """Commands (n, M, d_u) before and after each segment."""
-        first, last = (
-            interpolate(self.reference, torch.as_tensor(t))
-            for t in (self.segments.start, self.segments.settle)
-        )
+        times = map(torch.as_tensor, (self.segments.start, self.segments.settle))
+        first, last = (interpolate(self.reference, each) for each in times)
         return first, last
 
     @property
@@ -351,9 +316,9 @@ class CommandProblem:
     @torch.no_grad()
     def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual, and the Jacobian (n, S, d_y, P) of the predicted outputs."""
-        made = self._compiled(x)
+        made = None if self.memory else linearised_outputs(self, x, COMMAND_STEP)
         if made is not None:
-            return self._white(made[0]), self._white(made[1])
+            return self._white(self.observed - made[0]), self._white(made[1])
         parts = [map(part._white, part._linearised(some)) for part, some in self._batches(x)]
         residual, jacobian = zip(*parts, strict=True)
         return torch.cat(residual), torch.cat(jacobian)
@@ -398,9 +363,8 @@ class CommandProblem:
 
     def _residual(self, x: Tensor) -> Tensor:
         commands = self.commands(x)
-        if self.memory:
-            return self.observed - self.predicted(commands).double() / self.unit
-        return self.observed - outputs_at(self.surrogate, commands).double() / self.unit
+        outputs = self.predicted(commands) if self.memory else outputs_at(self.surrogate, commands)
+        return self.observed - outputs.double() / self.unit
 
     def _linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if self.memory:
@@ -423,26 +387,6 @@ class CommandProblem:
         if self.own_delays:
             parts.append(torch.einsum("nsyu,nmsu->nsymu", by_command, delay))
         return residual, torch.cat(parts, dim=-1).flatten(3)
-
-    def _compiled(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
-        """As `_linearised`, by a compiled kernel; None where that does not apply."""
-        if self.memory:
-            return None
-        made = linearised_outputs(
-            self.surrogate,
-            self.reference,
-            self.segments,
-            x,
-            self.missed,
-            self.sample,
-            self.frozen,
-            unit=self.unit,
-            step=COMMAND_STEP,
-        )
-        if made is None:
-            return None
-        outputs, jacobian = made
-        return self.observed - outputs, jacobian
 
     def _effective(self, x: Tensor, rows: Tensor) -> Tensor:
         """Effective commands for x (k, M, size) of the trajectories `rows` (k,), in order."""
