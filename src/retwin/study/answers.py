@@ -17,8 +17,7 @@ from retwin.diagnosis.trained.pooled import pool_probabilities
 from retwin.evaluation.fidelity.simulation import Simulation, record_means, simulation_scores
 from retwin.scores.bootstrap import Draws, Resampling, bootstrap_means
 from retwin.scores.classification import METRICS, confusion, score
-from retwin.study.estimates import read_estimates
-from retwin.study.files import Job
+from retwin.study.files import Job, read_estimates
 from retwin.study.work import Work
 from retwin.update.dynamics import DynamicsTwin, state_twin_of
 

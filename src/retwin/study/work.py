@@ -31,8 +31,7 @@ from retwin.evaluation.fidelity.simulation import simulate_records
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import save_model
-from retwin.study.estimates import write_estimates
-from retwin.study.files import Files, Job, Roles
+from retwin.study.files import Files, Job, Roles, write_estimates
 from retwin.study.plan import StudyPlan
 from retwin.study.trial import Trial
 from retwin.twins.faults.actuator_faults import Fault

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.cases.armpi_fpv.closed_form import KinematicTwin
 from retwin.cases.armpi_fpv.gauss_newton import gauss_newton
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
+from retwin.cases.armpi_fpv.twin import KinematicTwin
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 

@@ -9,8 +9,13 @@ from retwin.data.trajectories import Trajectories
 from retwin.evaluation.choice.fitted import Fitted
 from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Table, tabulate
-from retwin.report.choice.tables import comparison_table, parameter_table, term_table, units_of
-from retwin.report.choice.texts import model_sentences
+from retwin.report.choice.tables import (
+    comparison_table,
+    model_sentences,
+    parameter_table,
+    term_table,
+    units_of,
+)
 from retwin.report.figures.figure import Band, Figure, Key, Line, Mark, record_panel
 from retwin.report.identification.figures import OUTPUTS, SAMPLES
 from retwin.report.labels import significant

@@ -20,7 +20,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.twin import Twin
-from retwin.twins.wrappers.rebuilt import RebuiltTwin
+from retwin.twins.wrappers.parameter_values import RebuiltTwin
 from retwin.twins.wrappers.wrapper import TwinWrapper
 
 
