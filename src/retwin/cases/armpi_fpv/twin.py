@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.progress import Progress
-from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.faults.applied_faults import frozen_response
 from retwin.twins.limits import Limits
-from retwin.twins.twin import Chunk, ChunkedTwin
+from retwin.twins.twin import Chunk, ChunkedTwin, Twin
 from retwin.twins.wrappers.command_side import CommandSide, command_side_parameters
 from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
+from retwin.twins.wrappers.wrapper import OfTwin
 
 if TYPE_CHECKING:
     from retwin.twins.mujoco.twin import MuJoCoTwin
@@ -191,7 +189,7 @@ KINEMATIC = KinematicTwin(
 
 
 @dataclass(frozen=True)
-class ArmPiTwin:
+class ArmPiTwin(OfTwin):
     """The arm as a MuJoCo model: masses and inertias of its URDF, servos with a transport delay.
 
     The servos' stiffness, damping and delay in `armpi.xml` are fitted to the published twin
@@ -217,14 +215,9 @@ class ArmPiTwin:
     rate: float = RATE
 
     @property
-    def inputs(self) -> Channels:
-        """Command channels: motors 1 to 4."""
-        return KINEMATIC.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels: the end-effector's position."""
-        return KINEMATIC.outputs
+    def _inner(self) -> Twin:
+        """What has the same channels; no model is compiled to state them."""
+        return KINEMATIC
 
     @property
     def limits(self) -> Limits:
@@ -248,25 +241,9 @@ class ArmPiTwin:
             threads=self.threads,
         )
 
-    def simulate(
-        self,
-        commands: NDArray,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int,
-        progress: Progress | None = None,
-        parameters: Mapping[str, ArrayLike] | None = None,
-        hidden: dict[str, NDArray] | None = None,
-    ) -> Trajectories:
+    def simulate(self, commands: NDArray, **options: Any) -> Trajectories:
         """See `MuJoCoTwin.simulate`; `hidden` gets the angles of the five joints in rad."""
-        return self.physics.simulate(
-            commands,
-            faults=faults,
-            seed=seed,
-            progress=progress,
-            parameters=parameters,
-            hidden=hidden,
-        )
+        return self.physics.simulate(commands, **options)
 
     def respond(self, commands: NDArray, frozen: NDArray, failed: dict[int, str]) -> NDArray:
         """Integrate the response of motors 1 to 4.

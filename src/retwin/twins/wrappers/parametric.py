@@ -59,6 +59,12 @@ class TakesParameters(Twin, Protocol):
         """
 
 
+def takes_parameters(twin: Twin) -> bool:
+    """Whether the `simulate` of a twin takes values of parameters."""
+    accepted = signature(twin.simulate).parameters.values()
+    return any(each.name == "parameters" or each.kind == each.VAR_KEYWORD for each in accepted)
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A number of a twin that is not known exactly.
@@ -145,9 +151,8 @@ class ParametricTwin(TwinWrapper):
     held: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        accepted = signature(self.twin.simulate).parameters.values()
         require(
-            any(each.name == "parameters" or each.kind == each.VAR_KEYWORD for each in accepted),
+            takes_parameters(self.twin),
             "twin",
             expected="one whose simulate takes values of its parameters",
             got=type(self.twin).__name__,
