@@ -40,7 +40,7 @@ from retwin.update.blackbox import BLACK_BOXES, fit_black_box
 from retwin.update.corrected import CorrectedTwin, generate
 from retwin.update.dynamics import fit_dynamics
 from retwin.update.identification import NPE, Posterior, Updated, identify
-from retwin.update.residual import Density, Mixture, Residual, SequenceMixture, fit_residual
+from retwin.update.residual import Density, Mixture, SequenceMixture, fit_residual
 from retwin.update.surrogate import Surrogate, fit_surrogate
 
 MIN_HEALTHY = 5
@@ -221,7 +221,7 @@ class Work:
 
     def _residual(self, trial: Trial, path: Path) -> Costs:
         density = self.case.density
-        self._fitted(trial, self._calibration(trial), trial.job.name, density).save(path)
+        self._fitted(trial, self._calibration(trial), trial.job.name, density).residual.save(path)
         return {}
 
     def _update(self, trial: Trial, path: Path) -> Costs:
@@ -356,32 +356,26 @@ class Work:
     ) -> CorrectedTwin:
         """The corrected twin of a source, its RG fitted to other data or with another density."""
         (name,) = (name for kind, name in SOURCES[trial.job.name].needs if kind == "residual")
-        residual = self._fitted(trial, calibration, name, density)
-        return CorrectedTwin(self._base(trial, name), residual)
-
-    def _base(self, trial: Trial, residual: str) -> Surrogate:
-        """The surrogate that the residual model of that name corrects."""
-        return trial.surrogate(self._updated(residual))
-
-    def _updated(self, residual: str) -> str:
-        """The update of the twin whose surrogate that residual model corrects; "" for none."""
-        ((_, name),) = NEEDS["residual", residual]
-        return name
+        return self._fitted(trial, calibration, name, density)
 
     def _fitted(
         self, trial: Trial, calibration: Trajectories, name: str, density: Density | SequenceMixture
-    ) -> Residual:
+    ) -> CorrectedTwin:
+        """A surrogate with the RG of that name, of the twin as it is or after an update."""
         faults: Mapping[str, Fault | None] = self.case.faults
-        return fit_residual(
-            self._base(trial, name),
+        ((_, updated),) = NEEDS["residual", name]
+        surrogate = trial.surrogate(updated)
+        residual = fit_residual(
+            surrogate,
             calibration,
             trial.correction(name),
             density,
             seed=trial.seed("residual"),
             calibrate_on=faults if self._uses_labels else "healthy",
-            twin=trial.updated(updated) if (updated := self._updated(name)) else self.case.twin,
+            twin=trial.updated(updated) if updated else self.case.twin,
             progress=trial.progress,
         )
+        return CorrectedTwin(surrogate, residual)
 
     def _calibration(self, trial: Trial) -> Trajectories:
         return trial.labelled if self._uses_labels else trial.healthy

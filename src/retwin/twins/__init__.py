@@ -198,19 +198,18 @@ def made_by(found: Any) -> Any:
         inspect.signature(found).bind()
     except (TypeError, ValueError):  # it cannot be called, arguments are missing, or unknown
         return found
-    return found() if _is_function(found) else found
+    return found() if takes_commands(found) else found
 
 
 def takes_commands(found: Any) -> bool:
-    """Whether an object that `made_by` gave is a function of commands, which no twin is."""
-    return callable(found) and _is_function(found)
+    """Whether an object is a function or a class, and no twin, which may be called too.
 
-
-def _is_function(found: Any) -> bool:
-    # A class of twins satisfies the protocol too, although it is not a twin itself.
+    Of what `made_by` gave, it is a function of commands.
+    """
     from retwin.twins.twin import Twin
 
-    return isinstance(found, type) or not isinstance(found, Twin)
+    # A class of twins satisfies the protocol too, although it is not a twin itself.
+    return callable(found) and (isinstance(found, type) or not isinstance(found, Twin))
 
 
 def _unknown(name: str, got: str) -> InputError:
