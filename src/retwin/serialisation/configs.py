@@ -18,13 +18,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    PlainValidator,
-    ValidationError,
-    create_model,
-)
+from pydantic import BaseModel, ConfigDict, PlainValidator, ValidationError, create_model
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from retwin.checks import one_of, require
@@ -86,12 +80,7 @@ def to_config(value: Any, kinds: Sequence[type]) -> dict[str, Any]:
     return {"kind": type(value).__name__, **inside}
 
 
-def from_config(
-    values: Mapping[str, Any],
-    kinds: Sequence[type],
-    *,
-    place: str = "config",
-) -> Any:
+def from_config(values: Mapping[str, Any], kinds: Sequence[type], *, place: str = "config") -> Any:
     """The object that `to_config` described.
 
     Parameters
@@ -124,11 +113,7 @@ def from_config(
 
 
 def from_settings(
-    kind: type[T],
-    settings: Mapping[str, Any],
-    kinds: Sequence[type] = (),
-    *,
-    place: str,
+    kind: type[T], settings: Mapping[str, Any], kinds: Sequence[type] = (), *, place: str
 ) -> T:
     """An object of the dataclass `kind` from its parameters by name.
 
@@ -142,11 +127,7 @@ def from_settings(
 
 
 def checked(
-    kind: type,
-    settings: Mapping[str, Any],
-    *,
-    place: str,
-    besides: Sequence[str],
+    kind: type, settings: Mapping[str, Any], *, place: str, besides: Sequence[str]
 ) -> dict[str, Any]:
     """Some parameters of the dataclass `kind`, lists as tuples, each of the type it should have.
 

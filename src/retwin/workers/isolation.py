@@ -14,13 +14,7 @@ from numpy.typing import NDArray
 from retwin.errors import InputError
 from retwin.serialisation.sizes import Budget
 from retwin.workers.pools import scratch_folder
-from retwin.workers.process import (
-    FOREIGN,
-    ForeignProcess,
-    Frame,
-    ProcessEnded,
-    Retired,
-)
+from retwin.workers.process import FOREIGN, ForeignProcess, Frame, ProcessEnded, Retired
 
 OVERHEAD = 2**22
 """Bytes that an answer may take besides its arrays."""

@@ -95,8 +95,7 @@ def draw_prediction(
     times = chosen / records.rate
     panels = []
     for i in range(min(OUTPUTS, len(records.outputs))):
-        seen = records.mask[row, chosen, i]
-        values = np.where(seen, records.observed[row, chosen, i], np.nan)
+        values = records.measured[row, chosen, i]
         own, half = mean[row, chosen, i], USUAL * deviation[row, chosen, i]
         marks: list[Mark] = [
             Band(times, own - half, own + half, "90 % band", PREDICTED),
