@@ -226,29 +226,24 @@ class Work:
 
     def _update(self, trial: Trial, path: Path) -> Costs:
         """The update by Eq. 2 or Eq. 3, of the state equations, or by a model without a twin."""
+        case, seed, progress = self.case, trial.seed("update"), trial.progress
         if trial.job.name in BLACK_BOXES:
-            seed, progress = trial.seed("update"), trial.progress
             fitted = fit_black_box(trial.healthy, trial.job.name, seed=seed, progress=progress)
             fitted.twin.save(path)
             return {}
         if trial.job.name in ("dynamics", "fit"):
-            case, seed, progress = self.case, trial.seed("update"), trial.progress
             equations = case.state_surrogate if trial.job.name == "dynamics" else None
             simulated = case.sampler, case.per_class, case.network, case.training
             how = SurrogateSettings("auto", *simulated, equations=equations)
             twin = case.parametric or case.twin
-            base = stand_in(twin, trial.healthy, how, seed=seed, progress=progress).twin
+            # For "dynamics" it has state equations.
+            base: Any = stand_in(twin, trial.healthy, how, seed=seed, progress=progress).twin
             if trial.job.name == "fit":
                 settings, original = Choice.of(case), twin if isinstance(base, Surrogate) else None
                 taken = fit(base, trial.healthy, settings, seed=seed, original=original)
                 taken.twin.save(path)
                 return {"notes": f"chosen: {CANDIDATES[taken.chosen]}"}
-            made = fit_dynamics(
-                base,  # type: ignore[arg-type]  # it has state equations
-                trial.healthy,
-                self.case.dynamics,
-                progress=progress,
-            )
+            made = fit_dynamics(base, trial.healthy, case.dynamics, progress=progress)
             made.twin.save(path)
             write_estimates(path, made)
             return {"notes": made.reason}

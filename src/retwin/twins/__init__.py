@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from retwin._lazy import homes, names
 from retwin.catalog import TWINS, resolve
-from retwin.checks import nothing, require
+from retwin.checks import nothing
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 
@@ -142,13 +142,9 @@ def _from_module(
         return _of_function(name, found, inputs, outputs, rate)
     if not isinstance(found, Twin):
         raise _unknown(name, f"a {type(found).__name__}")
-    require(
-        not inputs and not outputs and rate is None,
-        f"twin {name!r}",
-        expected="neither channels nor a rate, since it has its own",
-        got=f"inputs {list(inputs)}, outputs {list(outputs)}, rate {rate}",
-        remedy="leave them out",
-    )
+    given = (*inputs, *outputs, *([f"{rate} Hz"] if rate is not None else []))
+    expected = "neither channels nor a rate, since it has its own"
+    nothing(f"twin {name!r}", given, expected, remedy="leave them out")
     return found
 
 
