@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY
-from retwin.errors import InputError
 from retwin.report.labels import order, quantities
 from retwin.results import FidelityResults, Results, read_results
 from retwin.results.sources import SourceResults
 from retwin.scores.decisions import Decision, decide
 from retwin.scores.histograms import Histogram, common_histogram
 from retwin.scores.uses import uses_of
+from retwin.serialisation.files import refusing
 
 AGAIN = "run `retwin study` with this folder as --out again"
 BANDS = ("nominal", "observed", "seen", "quantiles", "ids", "rate")
@@ -257,13 +257,9 @@ def read_study(folder: str | os.PathLike[str]) -> Study:
     path = Path(folder) / "arrays.npz"
     arrays: dict[str, Any] = {}
     if path.exists():
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-        except Exception as error:  # whatever zip, numpy or the disk raises
-            raise InputError(
-                "arrays.npz", expected="arrays of a study", got=f"{path} ({error})", remedy=AGAIN
-            ) from error
+        refused = refusing(path, expected="arrays of a study", remedy=AGAIN)
+        with refused, np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
     study = Study(results, arrays)
     if results.uses:
         return study
