@@ -25,7 +25,7 @@ import numpy as np
 from record import record
 
 import retwin as rt
-from retwin.cases.armpi_fpv.parameters import armpi_parametric
+from retwin.cases.armpi_fpv.twin import armpi_parametric
 from retwin.update.identification import NPE, identify
 
 FOLDS = 3

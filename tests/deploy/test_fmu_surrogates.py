@@ -20,7 +20,7 @@ import retwin as rt
 from retwin.compiler import compilers
 from retwin.deploy.actuator.draws import drawn
 from retwin.deploy.fmu.export import export_fmu
-from retwin.deploy.fmu.segments import DRAWS, ENSEMBLE
+from retwin.deploy.fmu.surrogates import DRAWS, ENSEMBLE
 from retwin.errors import InputError
 from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.twins.commands.range import CommandRange

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.cases.armpi_fpv.parameters import armpi_parametric
-from retwin.cases.armpi_fpv.twin import KINEMATIC
+from retwin.cases.armpi_fpv.twin import KINEMATIC, armpi_parametric
 from retwin.testing import TWIN_CHECKS, TwinSubject
 from retwin.twins.function import FunctionTwin
 from retwin.twins.mujoco.twin import MuJoCoTwin

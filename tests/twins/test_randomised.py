@@ -10,8 +10,7 @@ import pytest
 from scipy.stats import kstest
 
 import retwin as rt
-from retwin.cases.armpi_fpv.parameters import armpi_parametric
-from retwin.cases.armpi_fpv.twin import KINEMATIC
+from retwin.cases.armpi_fpv.twin import KINEMATIC, armpi_parametric
 from retwin.testing import TWIN_CHECKS, TwinSubject
 from retwin.twins.function import FunctionTwin
 from retwin.twins.wrappers.command_side import CommandSide, command_side_parameters

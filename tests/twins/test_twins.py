@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import retwin as rt
-from retwin.cases.armpi_fpv.closed_form import ServoLag
-from retwin.cases.armpi_fpv.twin import KINEMATIC
+from retwin.cases.armpi_fpv.twin import KINEMATIC, ServoLag
 
 
 def test_lag_follows_a_ramp_by_its_seconds() -> None:

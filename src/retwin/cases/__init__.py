@@ -20,11 +20,9 @@ if TYPE_CHECKING:
 _HOME = homes(
     {
         "animation": "animate",
-        "armpi_fpv.closed_form": "KinematicTwin",
         "armpi_fpv.emulator": "EmulatedArmPi",
-        "armpi_fpv.parameters": "armpi_parametric",
         "armpi_fpv.recovery": "recover_commands",
-        "armpi_fpv.twin": "ArmPiTwin",
+        "armpi_fpv.twin": "ArmPiTwin KinematicTwin armpi_parametric",
         "case": "Body Case",
         "columns": "ColumnRecords Record",
         "file": "read_case",

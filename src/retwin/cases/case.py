@@ -146,14 +146,8 @@ class Case(OfTwin):
     causes: Mapping[str, Fault] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        agree(
-            "sampler",
-            self.sampler,
-            self,
-            "that of the twin",
-            names=("rate",),
-            remedy="give both the same rate",
-        )
+        whose, remedy = "that of the twin", "give both the same rate"
+        agree("sampler", self.sampler, self, whose, names=("rate",), remedy=remedy)
         require(
             all(each.strip() for each in (self.name, *self.faults, *self.causes)),
             "name",

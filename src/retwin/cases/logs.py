@@ -13,15 +13,13 @@ from retwin.cases.columns import ColumnRecords
 from retwin.cases.matching import match_twin, usable
 from retwin.cases.named_signals import (
     Columns,
-    check_named,
     has_times,
     mapping_by_names,
-    missing_commands,
     resampling_of,
     signals_of,
 )
 from retwin.catalog import LOGS
-from retwin.checks import at_least, require
+from retwin.checks import at_least, nothing, require
 from retwin.data.io import load
 from retwin.data.logs.mapped import mapped
 from retwin.data.logs.mapping import NO_NOMINAL, read_mapping
@@ -203,14 +201,9 @@ class LogReader:
     def _check_columns(self, twin: Twin) -> None:
         """Refuse columns of channels that the twin does not have."""
         names = (*twin.inputs.names, *twin.outputs.names)
-        for name in self.columns.names:
-            require(
-                name in names,
-                "columns",
-                expected=f"channels of the twin, {', '.join(names)}",
-                got=repr(name),
-                remedy="write CHANNEL=COLUMN, the name in the twin first",
-            )
+        unknown = [repr(name) for name in self.columns.names if name not in names]
+        remedy = "write CHANNEL=COLUMN, the name in the twin first"
+        nothing("columns", unknown, f"channels of the twin, {', '.join(names)}", remedy=remedy)
 
     def _of_log(
         self,
@@ -255,17 +248,13 @@ class LogReader:
             got=f"columns {', '.join(log.signals)}",
             remedy="give --time COLUMN, or --rate HZ if each row is a sample at that rate",
         )
-        check_named(log, twin, columns.names, table=_is_text(path))
         mapping = mapping_by_names(log, twin, columns.names, table=_is_text(path))
-        budget = Budget(path.name, self.max_bytes)
-        missing_commands(log, mapping)
-        found = mapped(log, mapping, budget=budget)
+        found = mapped(log, mapping, budget=Budget(path.name, self.max_bytes))
         if len(found) == 1:
             found = found.replace(ids=[path.stem])
-        if not timed:
-            notes.setdefault(f"each row is a sample at {twin.rate:g} Hz", []).append(path.name)
-        else:
-            notes.setdefault(resampling_of(log, mapping, twin.rate), []).append(path.name)
+        how = f"each row is a sample at {twin.rate:g} Hz"
+        how = resampling_of(log, mapping, twin.rate) if timed else how
+        notes.setdefault(how, []).append(path.name)
         _add_notes(found, path.name, notes, whole=True)
         return match_twin(found, twin, {}, path.name, notes)
 

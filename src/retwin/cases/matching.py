@@ -227,8 +227,7 @@ def _check_size(found: Trajectories, *, largest: float = 1e30) -> None:
 
 def _constant(found: Trajectories) -> list[str]:
     """Channels that never change, among the commands and the outputs that were measured."""
-    values = np.where(found.mask, found.observed, np.nan)
-    every = np.moveaxis(np.concatenate([found.commands, values], axis=2), 2, 0)
+    every = np.moveaxis(np.concatenate([found.commands, found.measured], axis=2), 2, 0)
     return [
         name
         for name, each in zip((*found.inputs.names, *found.outputs.names), every, strict=True)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -172,11 +173,10 @@ def _list(names: Iterable[str]) -> str:
     return ", ".join(every[:LISTED]) + more
 
 
-def check_named(log: Log, twin: Twin, named: Mapping[str, str], *, table: bool) -> None:
-    """Refuse a log that lacks a command or all outputs, or whose times are a channel.
-
-    `table` states that it is a table of text.
-    """
+def _find_channels(
+    log: Log, twin: Twin, named: Mapping[str, str], *, table: bool
+) -> dict[str, str]:
+    """The signal of each channel; refuses logs without a command or all outputs, or such times."""
     names = (*twin.inputs.names, *twin.outputs.names)
     taken = [name for name, why in log.skipped.items() if why == TIMES]
     both = [each for each in names if named.get(each, each) in taken]
@@ -198,25 +198,19 @@ def check_named(log: Log, twin: Twin, named: Mapping[str, str], *, table: bool) 
         remedy="check that it is the right column, and how it writes numbers",
     )
     what, all_of = ("column", "columns") if table else ("signal", "signals")
-    lacking = [each for each in twin.inputs.names if each not in found]
-    mapped = (
-        "name it in [logs] of the case, as retwin identify --column does, or give a mapping: "
-        "retwin data map LOG --case TWIN --out mapping.toml"
-    )
+    wanted, lacking = f"an output of the twin, {', '.join(twin.outputs.names)}", ""
+    if missing := [each for each in twin.inputs.names if each not in found]:
+        wanted = f"every command, {', '.join(twin.inputs.names)}"
+        lacking = f"; none for {', '.join(missing)}"
     require(
-        not lacking,
+        not missing and any(each in found for each in twin.outputs.names),
         log.name,
-        expected=f"a {what} for every command, {', '.join(twin.inputs.names)}",
-        got=f"{all_of} {_list(log.signals)}; none for {', '.join(lacking)}",
-        remedy=mapped,
+        expected=f"a {what} for {wanted}",
+        got=f"{all_of} {_list(log.signals)}{lacking}",
+        remedy="name it in [logs] of the case, as retwin identify --column does, or give a "
+        "mapping: retwin data map LOG --case TWIN --out mapping.toml",
     )
-    require(
-        any(each in found for each in twin.outputs.names),
-        log.name,
-        expected=f"a {what} for an output of the twin, {', '.join(twin.outputs.names)}",
-        got=f"{all_of} {_list(log.signals)}",
-        remedy=mapped,
-    )
+    return found
 
 
 def mapping_by_names(log: Log, twin: Twin, named: Mapping[str, str], *, table: bool) -> LogMapping:
@@ -225,8 +219,25 @@ def mapping_by_names(log: Log, twin: Twin, named: Mapping[str, str], *, table: b
     A pause separates trajectories, as in the mapping that `retwin data map` proposes. Commands are
     held until they are sent again; in a table, where an empty cell is refused, over rows that are
     left out, up to the shortest pause.
+
+    Parameters
+    ----------
+    log : Log
+        All its signals.
+    twin : Twin
+        Whose channels they are.
+    named : mapping of str to str
+        Signals that the user names, by channel.
+    table : bool
+        Whether it is a table of text.
+
+    Raises
+    ------
+    InputError
+        A log that lacks a command, or all outputs, or whose times are a channel.
+
     """
-    found = signals_of(log, (*twin.inputs.names, *twin.outputs.names), named)
+    found = _find_channels(log, twin, named, table=table)
     signals = [log.signals[each] for each in found.values()]
     cut = cut_at_pauses(signals, 1 / twin.rate) if signals else Cut()
 
@@ -236,29 +247,23 @@ def mapping_by_names(log: Log, twin: Twin, named: Mapping[str, str], *, table: b
             if name not in found:
                 continue
             signal = log.signals[found[name]]
-            wanted = unit if unit != "1" else None
             proposed = channel_mapping(signal, kind, twin.rate, cut)
+            changes: dict[str, Any] = {"unit": unit if unit != "1" else None}
+            if table:
+                changes |= {"resample": None, "max_gap": None}
             if table and kind == "commands":
                 held = min(proposed.max_gap or math.inf, shortest_pause(1 / twin.rate))
-                usual = longest_bridge(signal.times, 1 / twin.rate)
-                made[name] = ChannelMapping(
-                    signal=signal.name, unit=wanted, max_gap=max(held, usual)
-                )
-            elif table:
-                made[name] = ChannelMapping(signal=signal.name, unit=wanted)
-            else:
-                made[name] = proposed.model_copy(update={"unit": wanted})
+                changes["max_gap"] = max(held, longest_bridge(signal.times, 1 / twin.rate))
+            made[name] = proposed.model_copy(update=changes)
         return made
 
-    return LogMapping(
-        rate=twin.rate,
-        cut=cut,
-        commands=channels(twin.inputs, "commands"),
-        outputs=channels(twin.outputs, "outputs"),
-    )
+    commands, outputs = channels(twin.inputs, "commands"), channels(twin.outputs, "outputs")
+    made = LogMapping(rate=twin.rate, cut=cut, commands=commands, outputs=outputs)
+    _refuse_missing(log, made)
+    return made
 
 
-def missing_commands(log: Log, mapping: LogMapping) -> None:
+def _refuse_missing(log: Log, mapping: LogMapping) -> None:
     """Refuse a table in which a command is missing before the last one.
 
     A trajectory would end there, in the middle of a record. Other logs have commands when they are

@@ -23,7 +23,7 @@ from retwin.twins.function import FunctionTwin
 from retwin.twins.limits import Limits
 from retwin.twins.mujoco.twin import MuJoCoTwin, Servo
 from retwin.twins.twin import Twin
-from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
+from retwin.twins.wrappers.parametric import Parameter, ParametricTwin, takes_parameters
 
 ELSEWHERE = ("path", "function", "inputs", "outputs", "sensors", "rate", "limits")
 """Parameters of twins that other keys of a case.toml set."""
@@ -213,7 +213,7 @@ def parametric_twin(twin: Twin, free: Sequence[Parameter], place: str) -> Parame
     Raises InputError for parameters that the twin does not take.
     """
     if not isinstance(twin, FunctionTwin):
-        if "parameters" not in inspect.signature(twin.simulate).parameters:
+        if not takes_parameters(twin):
             raise _takes_none(place, type(twin).__name__, free)
         with at(place):
             return ParametricTwin(twin, tuple(free))  # type: ignore[arg-type]

@@ -21,8 +21,8 @@ from retwin.twins.function import FunctionTwin
 from retwin.twins.mujoco.parameters import parameter_value, suggested_parameters
 from retwin.twins.mujoco.twin import MuJoCoTwin
 from retwin.twins.twin import Twin
+from retwin.twins.wrappers.parameter_values import RebuiltTwin
 from retwin.twins.wrappers.parametric import Parameter, ParametricTwin
-from retwin.twins.wrappers.rebuilt import RebuiltTwin
 
 SHOWN = 24
 """Parameters that a message lists, at most."""

@@ -38,7 +38,7 @@ CASES: Mapping[str, CaseEntry] = {
         f"retwin.cases.{room}.case:{name}", title, f"retwin.cases.{room}.{recorded}:RECORDED"
     )
     for name, room, recorded, title in (
-        ("armpi", "armpi_fpv", "recorded", "ArmPi FPV robot arm"),
+        ("armpi", "armpi_fpv", "recovery", "ArmPi FPV robot arm"),
         ("tanks", "cascaded_tanks", "twin", "two cascaded tanks, without overflow"),
         ("tanks_overflow", "cascaded_tanks", "twin", "two cascaded tanks that overflow"),
         ("silverbox", "silver_box", "twin", "Silverbox, a linear twin of a cubic spring"),

@@ -99,7 +99,9 @@ def fetch(
             f"put the file there by hand as {known.file}"
         ) from None
     finally:
-        _tidy(target.parent, place)
+        if target.parent != place:  # the folder of one file below the cache
+            with suppress(OSError):  # it is not empty, or does not exist
+                target.parent.rmdir()
     return target
 
 
@@ -127,13 +129,6 @@ def _find_file(name: str, url: str | None, sha256: str | None) -> PublicFile:
             remedy="choose one of these, or give a file name with its url and sha256",
         )
     return PublicFile(url, sha256, name)
-
-
-def _tidy(folder: Path, place: Path) -> None:
-    """Remove the empty folder below the cache of a file that could not be downloaded."""
-    if folder != place:
-        with suppress(OSError):  # it is not empty, or does not exist
-            folder.rmdir()
 
 
 def _download(

@@ -70,7 +70,20 @@ class Table:
 
     def numbers(self, name: str) -> tuple[NDArray, NDArray]:
         """The numbers (rows,) in a column, NaN where one is missing, and which are no numbers."""
-        return numbers(self.cells(name), comma=self.comma)
+        cells = self.cells(name)
+        bad = np.zeros(len(cells), bool)
+        try:
+            return cells.astype(float), bad
+        except (TypeError, ValueError):
+            made = np.full(len(cells), np.nan)
+        for row, cell in enumerate(cells.tolist()):
+            text = str(cell).strip()
+            small = text.lower()
+            try:
+                made[row] = float(TRUTH.get(small, text.replace(",", ".") if self.comma else text))
+            except ValueError:
+                bad[row] = small not in MISSING
+        return made, bad
 
     def time_name(self, clock: Clock) -> str:
         """The column of the times, stated or by its name; "" for rows at a rate.
@@ -144,27 +157,6 @@ class Table:
         dated = (each for each in self.units if self.cells(each).dtype.kind == "M")
         first = (each for each in list(self.units)[:1] if increases(self.cells(each)))
         return time_column(self.units) or next(dated, next(first, ""))
-
-
-def numbers(cells: NDArray, *, comma: bool = False) -> tuple[NDArray, NDArray]:
-    """Cells (n,) as numbers, NaN where one is missing, and which are no numbers.
-
-    `comma` states that decimals may be after a comma.
-    """
-    bad = np.zeros(len(cells), bool)
-    try:
-        return cells.astype(float), bad
-    except (TypeError, ValueError):
-        pass
-    made = np.full(len(cells), np.nan)
-    for row, cell in enumerate(cells.tolist()):
-        text = str(cell).strip()
-        small = text.lower()
-        try:
-            made[row] = float(TRUTH.get(small, text.replace(",", ".") if comma else text))
-        except ValueError:
-            bad[row] = small not in MISSING
-    return made, bad
 
 
 def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:

@@ -14,8 +14,8 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, Strict, ValidationInfo, model_validator
 
 from retwin.checks import require
+from retwin.serialisation.configs import Part, settings_of
 from retwin.serialisation.files import refusing
-from retwin.serialisation.settings import Part, settings_of
 
 PORT = 65535
 """The largest number of a port."""

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY
-from retwin.errors import InputError
 from retwin.report.labels import order, quantities
 from retwin.results import FidelityResults, Results, read_results
 from retwin.results.sources import SourceResults
 from retwin.scores.decisions import Decision, decide
 from retwin.scores.histograms import Histogram, common_histogram
 from retwin.scores.uses import uses_of
+from retwin.serialisation.files import refusing
 
 AGAIN = "run `retwin study` with this folder as --out again"
 BANDS = ("nominal", "observed", "seen", "quantiles", "ids", "rate")
@@ -69,48 +69,39 @@ class Study:
     def __post_init__(self) -> None:
         n, classes = len(self.results.data.test.labels), len(self.results.classes)
         for name in self.results.sources:
-            self._require(f"probabilities/{name}", (None, n, classes))
+            self._require({f"probabilities/{name}": (None, n, classes)})
         for name, fidelity in self.results.fidelity.items():
-            self._require_all(_fidelity_shapes(name, fidelity, self.arrays, self.bands(name)))
+            self._require(_fidelity_shapes(name, fidelity, self.arrays, self.bands(name)))
         self._check_overlay()
         if "simulation/observed" in self.arrays:
             self._check_simulations()
 
-    def _require_all(self, shapes: Mapping[str, Shape], *, needed: bool = False) -> None:
+    def _require(self, shapes: Mapping[str, Shape], *, needed: bool = False) -> None:
+        """The arrays must have these shapes, in which None stands for any length."""
         for name, shape in shapes.items():
-            self._require(name, shape, needed=needed)
-
-    def _require(self, name: str, shape: Shape, *, needed: bool = False) -> None:
-        """The array must have that shape, in which None stands for any length."""
-        found = self.arrays.get(name)
-        if found is None and not needed:
-            return
-        got = () if found is None else found.shape
-        same = len(got) == len(shape) and all(
-            w in (None, g) for w, g in zip(shape, got, strict=True)
-        )
-        wanted = ", ".join("…" if length is None else str(length) for length in shape)
-        require(
-            same and found is not None,
-            name,
-            expected=f"an array of shape ({wanted})",
-            got="none" if found is None else f"shape {got}",
-            remedy=AGAIN,
-        )
+            found = self.arrays.get(name)
+            if found is None and not needed:
+                continue
+            got = None if found is None else found.shape
+            wanted = ", ".join("…" if length is None else str(length) for length in shape)
+            require(
+                got is not None
+                and len(got) == len(shape)
+                and all(w in (None, g) for w, g in zip(shape, got, strict=True)),
+                name,
+                expected=f"an array of shape ({wanted})",
+                got="none" if got is None else f"shape {got}",
+                remedy=AGAIN,
+            )
 
     def _check_overlay(self) -> None:
         overlay, bands = self.results.overlay, self.arrays.get("portrait/bands")
         if overlay is None or bands is None:
             return
         n, outputs = len(self.results.overlaid), len(self.results.outputs.names)
-        self._require("portrait/bands", (n, 5, None, outputs))
-        require(
-            np.isfinite(bands).all(),
-            "portrait/bands",
-            expected="finite numbers",
-            got="numbers that are not",
-            remedy=AGAIN,
-        )
+        self._require({"portrait/bands": (n, 5, None, outputs)})
+        wanted, got = "finite numbers", "numbers that are not"
+        require(np.isfinite(bands).all(), "portrait/bands", expected=wanted, got=got, remedy=AGAIN)
         samples, latents = bands.shape[2], len(overlay.latents)
         values, chains = (n, samples, outputs), (n, samples, None, 3)
         shapes: dict[str, Shape] = {
@@ -124,30 +115,30 @@ class Study:
             shapes |= dict.fromkeys(("pose/nominal", "pose/observed"), chains)
         if "pose/updated" in self.arrays:
             shapes["pose/updated"] = chains
-        self._require_all(shapes, needed=True)
+        self._require(shapes, needed=True)
 
     def _check_simulations(self) -> None:
         arrays = self.arrays
-        self._require("simulation/observed", (None, None, None))
+        self._require({"simulation/observed": (None, None, None)})
         full = arrays["simulation/observed"].shape
-        self._require_all({"simulation/ids": full[:1], "simulation/rate": ()}, needed=True)
+        self._require({"simulation/ids": full[:1], "simulation/rate": ()}, needed=True)
         for name in self.results.sources:
-            self._require(f"simulation/{name}/mean", full)
-            self._require(f"simulation/{name}/bands", (full[0], 5, *full[1:]))
+            bands = (full[0], 5, *full[1:])
+            self._require({f"simulation/{name}/mean": full, f"simulation/{name}/bands": bands})
         if "simulation/commands" in arrays:
-            self._require("simulation/commands", (*full[:2], None))
+            self._require({"simulation/commands": (*full[:2], None)})
             channels = arrays["simulation/commands"].shape[2] + full[2]
-            self._require("simulation/range", (2, channels))
+            self._require({"simulation/range": (2, channels)})
         if "delta/values" in arrays:
-            self._require("delta/values", (None, None))
+            self._require({"delta/values": (None, None)})
             size = arrays["delta/values"].shape
             same = dict.fromkeys(("delta/discrepancy", "delta/deviation"), size)
             about: dict[str, Shape] = {"delta/range": (size[0], 2), "delta/about": (size[0], 4)}
-            self._require_all(same | about, needed=True)
+            self._require(same | about, needed=True)
         if "delta/parameters" in arrays:
-            self._require("delta/parameters", (None, 3))
+            self._require({"delta/parameters": (None, 3)})
             count = len(arrays["delta/parameters"])
-            self._require("delta/estimates", (count, 4), needed=True)
+            self._require({"delta/estimates": (count, 4)}, needed=True)
 
     @property
     def sources(self) -> dict[str, SourceResults]:
@@ -266,13 +257,9 @@ def read_study(folder: str | os.PathLike[str]) -> Study:
     path = Path(folder) / "arrays.npz"
     arrays: dict[str, Any] = {}
     if path.exists():
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-        except Exception as error:  # whatever zip, numpy or the disk raises
-            raise InputError(
-                "arrays.npz", expected="arrays of a study", got=f"{path} ({error})", remedy=AGAIN
-            ) from error
+        refused = refusing(path, expected="arrays of a study", remedy=AGAIN)
+        with refused, np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
     study = Study(results, arrays)
     if results.uses:
         return study

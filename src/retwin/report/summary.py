@@ -230,11 +230,8 @@ def _bars(study: Study, change: ErrorChange, given: str, source: str) -> Panel:
     before, after = factor * change.outputs_before, factor * change.outputs_after
     names = study.results.outputs.names
     if len(before) > MANY_OUTPUTS or len(before) != len(names):
-        before, after, names = (
-            np.array([factor * change.before]),
-            np.array([factor * change.after]),
-            ["all outputs"],
-        )
+        before, after = (np.array([factor * each]) for each in (change.before, change.after))
+        names = ["all outputs"]
     marks = [
         bar(place + shift + np.array([0.0, BAR]), np.array([value]), title, colour)
         for values, shift, title, colour in (

@@ -18,13 +18,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    PlainValidator,
-    ValidationError,
-    create_model,
-)
+from pydantic import BaseModel, ConfigDict, PlainValidator, ValidationError, create_model
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from retwin.checks import one_of, require
@@ -86,12 +80,7 @@ def to_config(value: Any, kinds: Sequence[type]) -> dict[str, Any]:
     return {"kind": type(value).__name__, **inside}
 
 
-def from_config(
-    values: Mapping[str, Any],
-    kinds: Sequence[type],
-    *,
-    place: str = "config",
-) -> Any:
+def from_config(values: Mapping[str, Any], kinds: Sequence[type], *, place: str = "config") -> Any:
     """The object that `to_config` described.
 
     Parameters
@@ -124,11 +113,7 @@ def from_config(
 
 
 def from_settings(
-    kind: type[T],
-    settings: Mapping[str, Any],
-    kinds: Sequence[type] = (),
-    *,
-    place: str,
+    kind: type[T], settings: Mapping[str, Any], kinds: Sequence[type] = (), *, place: str
 ) -> T:
     """An object of the dataclass `kind` from its parameters by name.
 
@@ -142,11 +127,7 @@ def from_settings(
 
 
 def checked(
-    kind: type,
-    settings: Mapping[str, Any],
-    *,
-    place: str,
-    besides: Sequence[str],
+    kind: type, settings: Mapping[str, Any], *, place: str, besides: Sequence[str]
 ) -> dict[str, Any]:
     """Some parameters of the dataclass `kind`, lists as tuples, each of the type it should have.
 
@@ -283,3 +264,61 @@ def _tuples(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {name: _tuples(each) for name, each in value.items()}
     return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class Part(BaseModel):
+    """What all tables of such a file have in common: no unknown keys, and no text for a number."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
+    )
+
+
+def settings_of(model: type[M], path: Path, *, expected: str, remedy: str) -> M:
+    """The settings in a file; validators get its folder as their context.
+
+    Raises
+    ------
+    InputError
+        The file is no TOML, a key is unknown or missing, or a value is refused. The message names
+        the file and the key.
+
+    """
+    tables = read_toml(path, expected=expected, remedy=remedy)
+    try:
+        return model.model_validate(tables, context=path.parent)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+    raise InputError(
+        f"{path}: {_key(first['loc'])}".removesuffix(": "),
+        expected=_expected(first),
+        got="none" if first["type"] == "missing" else _brief(first),
+        remedy=remedy,
+    )
+
+
+def _key(place: tuple[int | str, ...]) -> str:
+    """The key at which pydantic found an error, without the tags of its unions."""
+    parts = [str(each) for each in place]
+    if parts[:1] == ["sources"] and len(parts) > 2:
+        parts = [f"sources[{parts[1]}]", *parts[3:]]
+    return ".".join(each for each in parts if each != "function-after[_beside(), path]")
+
+
+def _expected(error: Any) -> str:
+    if error["type"] == "missing":
+        return "a value"
+    if error["type"] == "extra_forbidden":
+        return "a known key"
+    reason = plain_reason(error).removeprefix("Value error, ")
+    reason = reason.replace("String should have", "a text of")
+    return reason[:1].lower() + reason[1:]
+
+
+def _brief(error: Any) -> str:
+    """What was given, but for tables, which are too long to be shown."""
+    value = error["input"]
+    return "another one" if isinstance(value, dict | BaseModel) else repr(value)[:80]

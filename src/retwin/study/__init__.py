@@ -86,9 +86,8 @@ def run_study(
         scheduler, or if one of its workers does not see `out`.
 
     """
-    workers = (
-        (os.cpu_count() or 1) if processes is None else whole("processes", processes, at_least=1)
-    )
+    cores = os.cpu_count() or 1
+    workers = whole("processes", cores if processes is None else processes, at_least=1)
     require(
         processes is None or scheduler is None,
         "processes",

@@ -17,8 +17,7 @@ from retwin.diagnosis.trained.pooled import pool_probabilities
 from retwin.evaluation.fidelity.simulation import Simulation, record_means, simulation_scores
 from retwin.scores.bootstrap import Draws, Resampling, bootstrap_means
 from retwin.scores.classification import METRICS, confusion, score
-from retwin.study.estimates import read_estimates
-from retwin.study.files import Job
+from retwin.study.files import Job, read_estimates
 from retwin.study.work import Work
 from retwin.update.dynamics import DynamicsTwin, state_twin_of
 
@@ -53,6 +52,7 @@ class Diagnoses:
     family: ClassVar[tuple[str, ...]] = metrics_with("family", simulated=False)
     compared: ClassVar[tuple[str, ...]] = metrics_with("compared", simulated=False)
     curved: ClassVar[tuple[str, ...]] = metrics_with("selected", simulated=False)
+    records: ClassVar[int | None] = None
 
     @cached_property
     def _tested(self) -> list[int]:
@@ -67,11 +67,6 @@ class Diagnoses:
     def _resampling(self) -> Resampling:
         seed = self.work.plan.seed_of("bootstrap", 0)
         return Resampling(self._truth, self.work.case.classes, RESAMPLINGS, seed)
-
-    @property
-    def records(self) -> int | None:
-        """None: all trajectories have classes."""
-        return None
 
     def _probabilities(self, source: str, healthy: int = 0) -> NDArray:
         members = SOURCES[source].pool

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from retwin.cases.case import Case
-from retwin.checks import nothing, require
+from retwin.checks import given, nothing, require
 from retwin.data.io import load
 from retwin.data.quality.copies import distinct_records, find_copies
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -57,21 +57,21 @@ class StudyData:
     mapping: Path | None = None
 
     def __post_init__(self) -> None:
-        given = {name for name, file in vars(self).items() if file is not None} - {"twin"}
-        mapped = given & {"calibration", "test", "real"}
+        stated = {name for name, file in vars(self).items() if file is not None} - {"twin"}
+        mapped = stated & {"calibration", "test", "real"}
         require(
             self.mapping is None or mapped,
             "mapping",
             expected="real sets that are logs",
-            got=", ".join(sorted(given - {"mapping"})) or "none",
+            got=", ".join(sorted(stated - {"mapping"})) or "none",
             remedy="give --real LOG, or --calibration LOG --test LOG; or leave the mapping out",
         )
-        given -= {"mapping"}
+        stated -= {"mapping"}
         require(
-            given in ({"calibration", "test"}, {"real"}, {"records"}, set()),
+            stated in ({"calibration", "test"}, {"real"}, {"records"}, set()),
             "real data",
             expected="either calibration and test, or real alone, or records alone",
-            got=", ".join(sorted(given)),
+            got=", ".join(sorted(stated)),
             remedy="give --calibration FILE --test FILE, or --real FILE --folds K, or --data FILE",
         )
 
@@ -140,14 +140,10 @@ def _emulate(case: Case, healthy: int, seed: int) -> Trajectories:
 
 def _records(case: Case, path: Path) -> tuple[Trajectories, Trajectories]:
     """Calibration and test set of a file that the case splits."""
-    if case.records is None:
-        raise InputError(
-            "records",
-            expected="a case that declares how its file is split",
-            got=f"the case {case.name!r}, which does not",
-            remedy="give --calibration FILE --test FILE, or --real FILE --folds K",
-        )
-    return case.records(path)
+    expected = "a case that declares how its file is split"
+    got = f"the case {case.name!r}, which does not"
+    remedy = "give --calibration FILE --test FILE, or --real FILE --folds K"
+    return given("records", case.records, expected, got=got, remedy=remedy)(path)
 
 
 def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories, Roles]:

@@ -1,4 +1,4 @@
-"""The folder of a study: which file each job writes, and the roles of the real data."""
+"""The folder of a study: which file each job writes, the roles of the real data, estimates."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 
 from retwin.data.io import load
 from retwin.data.trajectories import Trajectories
-from retwin.serialisation.files import write_json
+from retwin.serialisation.files import read_json, write_json
+from retwin.update.dynamics import FittedDynamics
+
+ESTIMATES = "estimates.json"
+"""In the folder of an update, per parameter: name, estimate, error, what it is most correlated
+with, and how much. It is null for what is not determined."""
 
 
 @dataclass(frozen=True)
@@ -135,3 +140,41 @@ class Files:
     def real_data(self) -> Trajectories:
         """All real trajectories with commands."""
         return load(self.folder / "real.npz")
+
+
+def write_estimates(folder: Path, made: FittedDynamics) -> None:
+    """Write the estimates of the parameters of corrected dynamics beside the twin."""
+    rows = []
+    for name, value in made.parameters.items():
+        other, correlation = made.strongest(name) or ("", None)
+        error = made.errors[name]
+        rows.append([name, value, error if np.isfinite(error) else None, other, correlation])
+    write_json(folder / ESTIMATES, rows)
+
+
+def read_estimates(
+    folder: Path, given: Mapping[str, float], units: Mapping[str, str]
+) -> dict[str, NDArray]:
+    """The estimates as arrays; none of an update without parameters, or of an earlier version.
+
+    Parameters
+    ----------
+    folder : Path
+        That of the update.
+    given, units : mapping
+        The parameters' values before the update, and their units.
+
+    Returns
+    -------
+    dict of str to ndarray
+        `parameters` (k, 3), which are name, unit and what it is most correlated with, and
+        `estimates` (k, 4): the value as given, the estimate, its error and that correlation, NaN
+        for none.
+
+    """
+    rows = read_json(folder / ESTIMATES) if (folder / ESTIMATES).exists() else []
+    if not rows:
+        return {}
+    names = [[name, units.get(name, ""), other] for name, _, _, other, _ in rows]
+    values = [[given.get(name), value, error, r] for name, value, error, _, r in rows]
+    return {"parameters": np.array(names), "estimates": np.array(values, dtype=np.float64)}

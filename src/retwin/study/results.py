@@ -66,9 +66,10 @@ def write_results(
     arrays = found.arrays() | _record_arrays(checked)
     for name, each in fidelity.items():
         arrays |= _fidelity_arrays(name, each)
-    overlay = _overlay(work)
+    overlays = [Overlay.load(work.files.path(job)) for job in work.overlay_jobs()]
     shown: dict[str, Any] = {}
-    if overlay is not None:
+    if overlays:  # a twin was corrected
+        overlay = Overlay.concatenate(overlays)
         known = set(overlay.ids.tolist())
         shown_test = test[[name in known for name in test.ids.tolist()]]
         arrays |= _overlay_arrays(work, shown_test, overlay)
@@ -325,12 +326,6 @@ def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:
         f"bands/{source}/ids": found.ids[index],
         f"bands/{source}/rate": np.array(found.rate),
     }
-
-
-def _overlay(work: Work) -> Overlay | None:
-    """The predictions beside all test trajectories; None if no twin was corrected."""
-    made = [Overlay.load(work.files.path(job)) for job in work.overlay_jobs()]
-    return Overlay.concatenate(made) if made else None
 
 
 def _overlay_arrays(work: Work, test: Trajectories, overlay: Overlay) -> dict[str, NDArray]:

@@ -31,8 +31,7 @@ from retwin.evaluation.fidelity.simulation import simulate_records
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import save_model
-from retwin.study.estimates import write_estimates
-from retwin.study.files import Files, Job, Roles
+from retwin.study.files import Files, Job, Roles, write_estimates
 from retwin.study.plan import StudyPlan
 from retwin.study.trial import Trial
 from retwin.twins.faults.actuator_faults import Fault
@@ -41,7 +40,7 @@ from retwin.update.blackbox import BLACK_BOXES, fit_black_box
 from retwin.update.corrected import CorrectedTwin, generate
 from retwin.update.dynamics import fit_dynamics
 from retwin.update.identification import NPE, Posterior, Updated, identify
-from retwin.update.residual import Density, Mixture, Residual, SequenceMixture, fit_residual
+from retwin.update.residual import Density, Mixture, SequenceMixture, fit_residual
 from retwin.update.surrogate import Surrogate, fit_surrogate
 
 MIN_HEALTHY = 5
@@ -222,34 +221,29 @@ class Work:
 
     def _residual(self, trial: Trial, path: Path) -> Costs:
         density = self.case.density
-        self._fitted(trial, self._calibration(trial), trial.job.name, density).save(path)
+        self._fitted(trial, self._calibration(trial), trial.job.name, density).residual.save(path)
         return {}
 
     def _update(self, trial: Trial, path: Path) -> Costs:
         """The update by Eq. 2 or Eq. 3, of the state equations, or by a model without a twin."""
+        case, seed, progress = self.case, trial.seed("update"), trial.progress
         if trial.job.name in BLACK_BOXES:
-            seed, progress = trial.seed("update"), trial.progress
             fitted = fit_black_box(trial.healthy, trial.job.name, seed=seed, progress=progress)
             fitted.twin.save(path)
             return {}
         if trial.job.name in ("dynamics", "fit"):
-            case, seed, progress = self.case, trial.seed("update"), trial.progress
             equations = case.state_surrogate if trial.job.name == "dynamics" else None
             simulated = case.sampler, case.per_class, case.network, case.training
             how = SurrogateSettings("auto", *simulated, equations=equations)
             twin = case.parametric or case.twin
-            base = stand_in(twin, trial.healthy, how, seed=seed, progress=progress).twin
+            # For "dynamics" it has state equations.
+            base: Any = stand_in(twin, trial.healthy, how, seed=seed, progress=progress).twin
             if trial.job.name == "fit":
                 settings, original = Choice.of(case), twin if isinstance(base, Surrogate) else None
                 taken = fit(base, trial.healthy, settings, seed=seed, original=original)
                 taken.twin.save(path)
                 return {"notes": f"chosen: {CANDIDATES[taken.chosen]}"}
-            made = fit_dynamics(
-                base,  # type: ignore[arg-type]  # it has state equations
-                trial.healthy,
-                self.case.dynamics,
-                progress=progress,
-            )
+            made = fit_dynamics(base, trial.healthy, case.dynamics, progress=progress)
             made.twin.save(path)
             write_estimates(path, made)
             return {"notes": made.reason}
@@ -357,32 +351,26 @@ class Work:
     ) -> CorrectedTwin:
         """The corrected twin of a source, its RG fitted to other data or with another density."""
         (name,) = (name for kind, name in SOURCES[trial.job.name].needs if kind == "residual")
-        residual = self._fitted(trial, calibration, name, density)
-        return CorrectedTwin(self._base(trial, name), residual)
-
-    def _base(self, trial: Trial, residual: str) -> Surrogate:
-        """The surrogate that the residual model of that name corrects."""
-        return trial.surrogate(self._updated(residual))
-
-    def _updated(self, residual: str) -> str:
-        """The update of the twin whose surrogate that residual model corrects; "" for none."""
-        ((_, name),) = NEEDS["residual", residual]
-        return name
+        return self._fitted(trial, calibration, name, density)
 
     def _fitted(
         self, trial: Trial, calibration: Trajectories, name: str, density: Density | SequenceMixture
-    ) -> Residual:
+    ) -> CorrectedTwin:
+        """A surrogate with the RG of that name, of the twin as it is or after an update."""
         faults: Mapping[str, Fault | None] = self.case.faults
-        return fit_residual(
-            self._base(trial, name),
+        ((_, updated),) = NEEDS["residual", name]
+        surrogate = trial.surrogate(updated)
+        residual = fit_residual(
+            surrogate,
             calibration,
             trial.correction(name),
             density,
             seed=trial.seed("residual"),
             calibrate_on=faults if self._uses_labels else "healthy",
-            twin=trial.updated(updated) if (updated := self._updated(name)) else self.case.twin,
+            twin=trial.updated(updated) if updated else self.case.twin,
             progress=trial.progress,
         )
+        return CorrectedTwin(surrogate, residual)
 
     def _calibration(self, trial: Trial) -> Trajectories:
         return trial.labelled if self._uses_labels else trial.healthy

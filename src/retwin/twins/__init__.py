@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from retwin._lazy import homes, names
 from retwin.catalog import TWINS, resolve
-from retwin.checks import nothing, require
+from retwin.checks import nothing
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 
@@ -142,13 +142,9 @@ def _from_module(
         return _of_function(name, found, inputs, outputs, rate)
     if not isinstance(found, Twin):
         raise _unknown(name, f"a {type(found).__name__}")
-    require(
-        not inputs and not outputs and rate is None,
-        f"twin {name!r}",
-        expected="neither channels nor a rate, since it has its own",
-        got=f"inputs {list(inputs)}, outputs {list(outputs)}, rate {rate}",
-        remedy="leave them out",
-    )
+    given = (*inputs, *outputs, *([f"{rate} Hz"] if rate is not None else []))
+    expected = "neither channels nor a rate, since it has its own"
+    nothing(f"twin {name!r}", given, expected, remedy="leave them out")
     return found
 
 
@@ -198,19 +194,18 @@ def made_by(found: Any) -> Any:
         inspect.signature(found).bind()
     except (TypeError, ValueError):  # it cannot be called, arguments are missing, or unknown
         return found
-    return found() if _is_function(found) else found
+    return found() if takes_commands(found) else found
 
 
 def takes_commands(found: Any) -> bool:
-    """Whether an object that `made_by` gave is a function of commands, which no twin is."""
-    return callable(found) and _is_function(found)
+    """Whether an object is a function or a class, and no twin, which may be called too.
 
-
-def _is_function(found: Any) -> bool:
-    # A class of twins satisfies the protocol too, although it is not a twin itself.
+    Of what `made_by` gave, it is a function of commands.
+    """
     from retwin.twins.twin import Twin
 
-    return isinstance(found, type) or not isinstance(found, Twin)
+    # A class of twins satisfies the protocol too, although it is not a twin itself.
+    return callable(found) and (isinstance(found, type) or not isinstance(found, Twin))
 
 
 def _unknown(name: str, got: str) -> InputError:

@@ -6,9 +6,8 @@ import inspect
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, ExitStack
 from dataclasses import KW_ONLY, dataclass
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from retwin.times import sample_rate
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, simulate_in_chunks
-from retwin.twins.workers import worker_processes
+from retwin.twins.workers import keep_workers, worker_processes
 from retwin.workers.pools import check_sendable, sendable_errors, worker_pool
 
 TRAJECTORIES_PER_CHUNK = 128
@@ -142,22 +141,19 @@ class FunctionTwin:
                 done = chunk.index.start + fraction * len(chunk.commands)
                 progress(done / len(commands))
 
-        with ExitStack() as stack:
+        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+            if self.workers == 1:
+                return self._run(None, chunk, report)
             # No process is started before commands and faults are found good.
-            pool = cache(lambda: stack.enter_context(self._workers()) if self.workers > 1 else None)
+            key = (FunctionTwin, self.workers)  # processes can serve every function
+            with worker_processes(key, lambda: worker_pool(self.workers)) as pool:
+                return self._run(pool, chunk, report)
 
-            def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-                return self._run(pool(), chunk, report)
-
-            size = TRAJECTORIES_PER_CHUNK
+        size = TRAJECTORIES_PER_CHUNK
+        with keep_workers():
             return simulate_in_chunks(
                 self, run, commands, faults, seed=seed, progress=progress, size=size
             )
-
-    def _workers(self) -> AbstractContextManager[ProcessPool]:
-        """Processes that can serve every function."""
-        key = (FunctionTwin, self.workers)
-        return worker_processes(key, lambda: worker_pool(self.workers))
 
     def _run(
         self, pool: ProcessPool | None, chunk: Chunk, report: Callable

@@ -31,9 +31,7 @@ from retwin.errors import InputError, place_of
 
 @contextmanager
 def worker_pool(
-    workers: int,
-    start: Callable[..., None] | None = None,
-    arguments: tuple[Any, ...] = (),
+    workers: int, start: Callable[..., None] | None = None, arguments: tuple[Any, ...] = ()
 ) -> Iterator[ProcessPool]:
     """A pool of spawned processes.
 

@@ -14,7 +14,7 @@ import pytest
 
 import retwin as rt
 from retwin import arrays
-from retwin.data.io import scratch
+from retwin.data.io import zarr_folder
 from retwin.data.io.zarr_folder import read_zarr
 from retwin.deploy.simulations import simulate_to
 from retwin.nets.networks import Standardise
@@ -49,7 +49,7 @@ def test_a_set_that_does_not_fit(work: str, sets: dict[str, Path], tmp_path: Pat
 def test_what_is_read_is_a_map_and_leaves_nothing(
     sets: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scratch.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(zarr_folder.tempfile, "tempdir", str(tmp_path))
     made = rt.load(sets["small"])
     base = made.observed
     while isinstance(base.base, np.ndarray):

@@ -10,7 +10,7 @@ import pytest
 from toys import AFFINE, LAG, LINE, PRODUCT, commands, lag, line, measured, parametric
 
 import retwin as rt
-from retwin.cases.armpi_fpv.parameters import armpi_parametric
+from retwin.cases.armpi_fpv.twin import armpi_parametric
 from retwin.testing import TWIN_CHECKS, TwinSubject
 from retwin.update.identification import Evolution, LeastSquares, identify, profile
 from retwin.update.identification.search import Loss

@@ -141,11 +141,10 @@ def _draws(updated: Twin, one: Trajectories, seed: int) -> Trajectories:
 
 def _chart(one: Trajectories, drawn: NDArray) -> Chart:
     """The chart of the output that deviates most from the nominal one."""
-    observed = np.where(one.mask[0], one.observed[0], np.nan) - one.nominal[0]
-    error = (
-        np.nanmean(np.square(observed), axis=0) if one.mask.any() else np.zeros(len(one.outputs))
-    )
-    column = int(np.nanargmax(np.where(np.isfinite(error), error, -1.0)))
+    observed = one.measured[0] - one.nominal[0]
+    seen = one.mask[0].sum(axis=0)
+    error = np.where(seen > 0, np.nansum(np.square(observed), axis=0) / np.maximum(seen, 1), -1.0)
+    column = int(np.argmax(error))
     unit = one.outputs.units[column]
     factor, shown = (1000.0, "mm") if unit == "m" else (1.0, unit)
     return Chart(

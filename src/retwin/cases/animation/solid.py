@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pebble import ProcessExpired, ProcessPool
 
 from retwin.cases.animation.shots import GHOST, PAPER, Camera, Pictures, Shots
-from retwin.checks import install_command, require
+from retwin.checks import given, install_command, require
 from retwin.errors import InputError, brief
 from retwin.workers.pools import worker_pool
 
@@ -60,13 +60,8 @@ def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator
         The body has no model, the model lacks a joint, a package is missing, or no backend works.
 
     """
-    require(
-        body.model is not None,
-        "renderer",
-        expected="a body with a model",
-        got="a body that is a chain of points only",
-        remedy="draw it as a stick figure",
-    )
+    got, remedy = "a body that is a chain of points only", "draw it as a stick figure"
+    model = given("renderer", body.model, "a body with a model", got=got, remedy=remedy)
     require(
         importlib.util.find_spec("OpenGL") is not None,
         "renderer",
@@ -74,7 +69,7 @@ def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator
         got="an installation without it",
         remedy=f"install it: {install_command('render')}",
     )
-    stage = _Stage(str(body.model), body.joints, Camera.of(shots, size))
+    stage = _Stage(str(model), body.joints, Camera.of(shots, size))
     named = os.environ.get("MUJOCO_GL", "").lower()
     reasons = []
     for backend in (named,) if named else BACKENDS:

@@ -9,14 +9,15 @@ motor may deviate from the command in several joints.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.cases.armpi_fpv.closed_form import KinematicTwin
 from retwin.cases.armpi_fpv.gauss_newton import gauss_newton
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
+from retwin.cases.armpi_fpv.twin import KinematicTwin
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 
@@ -137,39 +138,22 @@ def nearest_poses(
     out = np.empty_like(commanded)
     before = commanded[:, 0]
     chosen = np.arange(len(commanded))
+    stay = COMMAND_WEIGHT * np.eye(arm.joints)
+
+    def evaluate(pose: NDArray, t: int) -> tuple[NDArray, NDArray]:
+        deviation = COMMAND_WEIGHT * (pose - commanded[:, t])
+        error = np.concatenate([arm.position(pose) - tip[:, t], deviation], axis=-1)
+        slope = arm.jacobian(pose)
+        fixed = np.broadcast_to(stay, (*slope.shape[:-2], *stay.shape))
+        return error, np.concatenate([slope, fixed], axis=-2)
+
     for t in range(commanded.shape[1]):
-        goal = commanded[:, t]
-        found, cost = _descend(arm, np.stack([before, goal]), goal, tip[:, t])
+        start = np.stack([before, commanded[:, t]])
+        # Few steps suffice, since each sample starts at the pose of the sample before.
+        found, cost = gauss_newton(partial(evaluate, t=t), start, rounds=8)
         before = found[(cost[1] < switch_ratio * cost[0]).astype(int), chosen]
         out[:, t] = before
     return out
-
-
-def _descend(
-    arm: YawPitchArm,
-    start: NDArray,
-    commanded: NDArray,
-    tip: NDArray,
-    *,
-    gauss_newton_steps: int = 8,
-) -> tuple[NDArray, NDArray]:
-    """Poses (..., joints) and their cost (...) by damped Gauss-Newton from `start`.
-
-    Parameters
-    ----------
-    gauss_newton_steps : int, default 8
-        Number of damped Gauss-Newton steps per sample; they suffice since each sample starts at the
-        pose of the sample before.
-
-    """
-    stay = np.broadcast_to(COMMAND_WEIGHT * np.eye(arm.joints), (*start.shape, arm.joints))
-
-    def evaluate(pose: NDArray) -> tuple[NDArray, NDArray]:
-        deviation = COMMAND_WEIGHT * (pose - commanded)
-        error = np.concatenate([arm.position(pose) - tip, deviation], axis=-1)
-        return error, np.concatenate([arm.jacobian(pose), stay], axis=-2)
-
-    return gauss_newton(evaluate, start, rounds=gauss_newton_steps)
 
 
 def _interpolate(trajectories: Trajectories) -> NDArray:

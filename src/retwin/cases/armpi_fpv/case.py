@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from retwin.cases.armpi_fpv.body import ArmBody
 from retwin.cases.armpi_fpv.emulator import EmulatedArmPi
-from retwin.cases.armpi_fpv.parameters import armpi_parametric
-from retwin.cases.armpi_fpv.recorded import BIASED, STUCK, recover
+from retwin.cases.armpi_fpv.recovery import BIASED, STUCK, recover
 from retwin.cases.armpi_fpv.twin import (
     ARM,
     KINEMATIC,
@@ -20,6 +19,7 @@ from retwin.cases.armpi_fpv.twin import (
     STRAIGHT,
     UNIT,
     ArmPiTwin,
+    armpi_parametric,
 )
 from retwin.cases.case import Case
 from retwin.data.trajectories import HEALTHY, Trajectories

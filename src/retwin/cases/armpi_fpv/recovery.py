@@ -6,11 +6,13 @@ and leaves a planar arm with signed radius r and height h. Targets of the real r
 command units, and enumeration decides exactly (`plane`). Targets of the simulated paths are not on
 that grid; Gauss-Newton over all ramp combinations finds them (`search`). Other explanations of a
 path with about the same error are counted, which makes `Recovery.ambiguous` a computed result.
+`RECORDED` is what files of the arm's trajectories need of its case.
 """
 
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,11 +23,20 @@ from numpy.typing import NDArray
 from retwin.arrays import check_finite
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.cases.armpi_fpv.path_fit import PathFit, path_noise
-from retwin.cases.armpi_fpv.twin import RAMPS, STRAIGHT
+from retwin.cases.armpi_fpv.twin import ARM, KINEMATIC, RAMPS, STRAIGHT
+from retwin.cases.recorded import RecordedCase
 from retwin.checks import require
+from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.progress import Progress
 
 PATHS_PER_BATCH = 32
 """Number of paths that are solved together: they fit the cache, and every core has work."""
+STUCK = tuple(f"Motor_{i}_Stuck" for i in range(1, 5))
+"""Classes in which motor i stops moving."""
+BIASED = tuple(f"Motor_{i}_Steady_state_error" for i in range(1, 5))
+"""Classes in which motor i settles at a biased target: the paper's steady-state error (SSE)."""
+CLASSES = (HEALTHY, *STUCK, *BIASED)
+"""All classes in the order of probabilities and of confusion matrices."""
 
 
 @dataclass(frozen=True)
@@ -193,3 +204,38 @@ def _enter(fit: PathFit, result: Recovery, rows: NDArray) -> None:
     result.closed[rows], result.whole[rows] = fit.closed, fit.whole
     result.rms[rows] = fit.rms
     result.ambiguous[rows, :moves] = fit.ambiguous
+
+
+def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:
+    """Recover commands from the desired path; a warning names ambiguous trajectories.
+
+    Parameters
+    ----------
+    trajectories : Trajectories
+        Trajectories whose `nominal` is the desired end-effector path in m.
+    progress : callable, optional
+        Called with the finished fraction.
+
+    Returns
+    -------
+    Trajectories
+        The same with commands.
+
+    """
+    found = recover_commands(trajectories.nominal, arm=ARM, progress=progress)
+    ambiguous = np.any(found.ambiguous, axis=1)
+    if ambiguous.any():
+        warnings.warn(
+            f"commands of {ambiguous.sum()} of {len(ambiguous)} trajectories are not certain: "
+            f"{', '.join(trajectories.ids[ambiguous][:5])}{' …' if ambiguous.sum() > 5 else ''}",
+            stacklevel=2,
+        )
+    return trajectories.replace(
+        commands=found.commands.astype(np.float32),
+        inputs=KINEMATIC.inputs,
+        outputs=KINEMATIC.outputs,
+    )
+
+
+RECORDED = RecordedCase(CLASSES, KINEMATIC, recover)
+"""What files of the arm's trajectories need of its case."""

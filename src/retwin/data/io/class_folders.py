@@ -20,7 +20,7 @@ from retwin.errors import InputError
 from retwin.progress import Progress, tracked
 from retwin.serialisation.files import sha256
 from retwin.serialisation.sizes import Budget
-from retwin.workers.reader import FileReader
+from retwin.workers.isolation import FileReader
 
 Reader = Callable[[Path, str, "DataCase | None", Budget, FileReader], Raw]
 COORDINATES = 3

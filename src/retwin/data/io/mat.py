@@ -15,8 +15,8 @@ from retwin.data.trajectories import Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.serialisation.files import check_regular, sha256
 from retwin.serialisation.sizes import Budget
+from retwin.workers.isolation import FileReader
 from retwin.workers.process import Frame
-from retwin.workers.reader import FileReader
 
 PAIRS = (("X_array", "y_array"), ("X_test_array", "y_test_array"))
 """The names of the variables that hold trajectories and class names."""

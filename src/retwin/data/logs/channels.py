@@ -71,10 +71,7 @@ class Channel:
         notes = list(self.notes)
         if self.how != "hold" and own > decimated * rate:
             notes.append("samples left out, not filtered")
-        bridged, longest = (
-            self.longest if self.how != "none" else 0.0,
-            float(steps.max(initial=0.0)),
-        )
+        bridged, longest = self.longest * (self.how != "none"), float(steps.max(initial=0.0))
         about = (own, missing, bridged, longest, "; ".join(notes))
         return Sampling(self.name, self.signal.name, self.how, *about)
 

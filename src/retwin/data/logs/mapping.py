@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 
 from retwin.data.logs.signals import Clock, TimeUnit
 from retwin.data.resampling import Resampling
-from retwin.serialisation.settings import Part, settings_of
+from retwin.serialisation.configs import Part, settings_of
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]

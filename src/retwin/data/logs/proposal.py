@@ -168,11 +168,6 @@ def _read_stamped(
     return (other, found) if 0 <= found < max_stamp_age else None
 
 
-def facts_of(log: Log) -> list[Fact]:
-    """What is seen of the signals of a log."""
-    return [_fact(each) for each in log.signals.values()]
-
-
 def _fact(signal: Signal) -> Fact:
     known = np.isfinite(signal.values)
     values, at = signal.values[known], np.sort(signal.times[known])
@@ -210,7 +205,7 @@ def proposed(
         No signal changes, or none at times of its own.
 
     """
-    facts = facts_of(log)
+    facts = [_fact(each) for each in log.signals.values()]
     moving = [each for each in facts if _moves(each)]
     if not moving:
         for each in facts:

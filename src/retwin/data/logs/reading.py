@@ -15,8 +15,8 @@ from retwin.data.logs.signals import MAX_SIGNALS, NANOSECOND, Clock, Log, Signal
 from retwin.progress import Progress
 from retwin.serialisation.files import refusing, sha256
 from retwin.serialisation.sizes import Budget
+from retwin.workers.isolation import FileReader
 from retwin.workers.process import Frame
-from retwin.workers.reader import FileReader
 
 BAG = "metadata.yaml"
 """The file that every ROS 2 bag has."""

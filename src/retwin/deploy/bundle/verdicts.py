@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from retwin.arrays import floats
 from retwin.checks import agree, given, require
@@ -191,11 +192,7 @@ class Domain:
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Domain:
         """The domain from the values of `dataclasses.asdict`, with JSON lists or tuples."""
-        return cls(
-            **{name: floats(values[name]) for name in (*COMMANDS, *OUTPUTS)},
-            mismatch=float(values["mismatch"]),
-            energy=float(values["energy"]),
-        )
+        return TypeAdapter(cls).validate_python(values)
 
     @classmethod
     def around(cls, sets: Sequence[Trajectories]) -> Domain:

@@ -6,15 +6,14 @@ import re
 import uuid
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from importlib import resources
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
 
 from retwin._version import __version__
 from retwin.data.trajectories import Channels
 from retwin.twins.wrappers.parametric import Parameter
-
-EPOCH = datetime(1980, 1, 1, tzinfo=UTC)
-"""The date in a file, which does not depend on when it was made."""
 
 
 @dataclass(frozen=True)
@@ -168,78 +167,32 @@ def description(
 
     """
     two = version == "2.0"
-    root = Element(
-        "fmiModelDescription",
-        {
-            "fmiVersion": version,
-            "modelName": _printable(about) or identifier,
-            "guid" if two else "instantiationToken": token,
-            "description": "Corrected twin, sampled; made by retwin, without the user's simulator",
-            "generationTool": f"retwin {__version__}",
-            "generationDateAndTime": EPOCH.strftime("%Y-%m-%dT%H:%M:%SZ"),
-            "variableNamingConvention": "flat",
-        },
-    )
-    able = [f"{verb}FMU{'state' if two else 'State'}" for verb in ("canGetAndSet", "canSerialize")]
-    facts = dict.fromkeys((*able, "canHandleVariableCommunicationStepSize"), "true")
-    inside = SubElement(root, "CoSimulation", {"modelIdentifier": identifier, **facts})
-    if two:
-        SubElement(SubElement(inside, "SourceFiles"), "File", {"name": f"{identifier}.c"})
-    units = sorted({each.unit for each in variables if each.unit})
-    definitions = SubElement(root, "UnitDefinitions") if units else root
-    for unit in units:
-        SubElement(definitions, "Unit", {"name": unit})
-    SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(period)})
-    listed = SubElement(root, "ModelVariables")
     shown = [(i, each) for i, each in enumerate(variables) if not (two and each.role == "time")]
-    for reference, each in shown:
-        _add_variable(listed, reference, each, two=two)
-    structure = SubElement(root, "ModelStructure")
-    outputs = [i for i, (_, each) in enumerate(shown) if each.role in OUTPUTS]
-    for tag in ("Output", "InitialUnknown"):
-        held = SubElement(structure, f"{tag}s") if two else structure
-        for i in outputs:
-            place = {"index": str(i + 1)} if two else {"valueReference": str(shown[i][0])}
-            SubElement(held, "Unknown" if two else tag, place)
-    return _written(root)
-
-
-def _add_variable(listed: Element, reference: int, each: Variable, *, two: bool) -> None:
-    """Add a variable to the list of ModelVariables."""
-    kinds = {"seed": "Integer" if two else "Int32", "noise": "Boolean", "outside": "Boolean"}
-    kind = kinds.get(each.role, "Real" if two else "Float64")
-    common = {"name": each.name, "valueReference": str(reference)}
-    if each.about:
-        common["description"] = each.about
-    values = {"unit": each.unit} if each.unit else {}
-    common |= dict(zip(("causality", "variability"), CAUSALITY[each.role], strict=True))
-    if each.role == "time":
-        values = {}
-    elif each.role in OUTPUTS:
-        common["initial"] = "calculated"
-    else:
-        starts = {"seed": "0", "noise": "false"}
-        values["start"] = starts.get(each.role, repr(float(each.start)))
-    if each.limits is not None:
-        low, high = map(float, each.limits)
-        largest = max(abs(low), abs(high))
-        values |= {"min": repr(low), "max": repr(high)}
-        values |= {"nominal": repr(largest)} if largest > 0 else {}
-    if two:
-        SubElement(SubElement(listed, "ScalarVariable", common), kind, values)
-    else:
-        SubElement(listed, kind, {**common, **values})
+    return _fill(
+        "modelDescription.xml",
+        version=version,
+        two=two,
+        identifier=identifier,
+        token=token,
+        about=_printable(about),
+        retwin=__version__,
+        units=sorted({each.unit for each in variables if each.unit}),
+        period=period,
+        shown=shown,
+        causalities=CAUSALITY,
+        outputs=OUTPUTS,
+    )
 
 
 def build_description(identifier: str) -> bytes:
     """The file sources/buildDescription.xml of FMI 3.0."""
-    root = Element("fmiBuildDescription", {"fmiVersion": "3.0"})
-    build = SubElement(root, "BuildConfiguration", {"modelIdentifier": identifier})
-    files = SubElement(build, "SourceFileSet", {"language": "C99"})
-    SubElement(files, "SourceFile", {"name": f"{identifier}.c"})
-    return _written(root)
+    return _fill("buildDescription.xml", identifier=identifier)
 
 
-def _written(root: Element) -> bytes:
-    indent(root)
-    return tostring(root, encoding="UTF-8", xml_declaration=True)
+def _fill(name: str, **values: Any) -> bytes:
+    """The file of that name, by its template."""
+    made = Environment(
+        undefined=StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    template = resources.files(__package__).joinpath(f"{name}.j2").read_text("utf-8")
+    return made.from_string(template).render(values).encode()

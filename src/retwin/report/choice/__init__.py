@@ -5,7 +5,11 @@ computes, and other prose, which is in its template.
 """
 
 from retwin.report.choice.page import fit_page
-from retwin.report.choice.tables import comparison_table, parameter_table, term_table
-from retwin.report.choice.texts import model_sentences
+from retwin.report.choice.tables import (
+    comparison_table,
+    model_sentences,
+    parameter_table,
+    term_table,
+)
 
 __all__ = ["comparison_table", "fit_page", "model_sentences", "parameter_table", "term_table"]

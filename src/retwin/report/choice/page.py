@@ -9,8 +9,13 @@ from retwin.data.trajectories import Trajectories
 from retwin.evaluation.choice.fitted import Fitted
 from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Table, tabulate
-from retwin.report.choice.tables import comparison_table, parameter_table, term_table, units_of
-from retwin.report.choice.texts import model_sentences
+from retwin.report.choice.tables import (
+    comparison_table,
+    model_sentences,
+    parameter_table,
+    term_table,
+    units_of,
+)
 from retwin.report.figures.figure import Band, Figure, Key, Line, Mark, record_panel
 from retwin.report.identification.figures import OUTPUTS, SAMPLES
 from retwin.report.labels import significant
@@ -90,8 +95,7 @@ def draw_prediction(
     times = chosen / records.rate
     panels = []
     for i in range(min(OUTPUTS, len(records.outputs))):
-        seen = records.mask[row, chosen, i]
-        values = np.where(seen, records.observed[row, chosen, i], np.nan)
+        values = records.measured[row, chosen, i]
         own, half = mean[row, chosen, i], USUAL * deviation[row, chosen, i]
         marks: list[Mark] = [
             Band(times, own - half, own + half, "90 % band", PREDICTED),

@@ -36,10 +36,7 @@ ROW_HEIGHT, MARGIN = 34, 80
 def figures(found: Identification) -> dict[str, Figure]:
     """The figures that have something to show, by name."""
     measured, before, after = found.simulated[found.compared]
-    errors = [
-        np.where(measured.mask, measured.observed.astype(float) - each, np.nan)
-        for each in (before, after)
-    ]
+    errors = [measured.measured.astype(float) - each for each in (before, after)]
     shown = [i for i in range(len(measured.outputs)) if measured.mask[..., i].any()][:OUTPUTS]
     made = [_estimates(found), _records(found, shown), *_residuals(measured, errors, shown)]
     return {each.name: each for each in made if each.panels}
@@ -87,9 +84,9 @@ def _records(found: Identification, shown: list[int]) -> Figure:
     times = chosen / measured.rate
     panels = []
     for i in shown:
-        values = np.where(measured.mask[row, :, i], measured.observed[row, :, i], np.nan)
+        values = measured.measured[row, chosen, i]
         marks: list[Mark] = [
-            Line(times, values[chosen], "measured", MEASURED, width=2.6, alpha=0.45),
+            Line(times, values, "measured", MEASURED, width=2.6, alpha=0.45),
             Line(times, before[row, chosen, i], "before", BEFORE, "dash", 1.6),
             Line(times, after[row, chosen, i], "after", AFTER, width=1.6),
         ]
@@ -101,7 +98,7 @@ def _records(found: Identification, shown: list[int]) -> Figure:
 
 def _typical(measured: Trajectories, after: NDArray) -> int:
     """The trajectory whose error, over all outputs in units of their spread, is the median."""
-    error = np.where(measured.mask, measured.observed - after, np.nan)
+    error = measured.measured - after
     values = [measured.observed[..., i][measured.mask[..., i]] for i in range(error.shape[2])]
     spread = np.array([each.std() if len(each) else 0.0 for each in values])
     scaled = error / np.where(spread > 0, spread, 1.0)
@@ -119,8 +116,8 @@ def _residuals(measured: Trajectories, errors: list[NDArray], shown: list[int]) 
     for i in shown:
         pair = [each[..., i] for each in errors]
         if all(map(_useful, pair)):
-            values = np.where(measured.mask[..., i], measured.observed[..., i], np.nan)
-            output = ChannelRecords(about.names[i], about.units[i], values.astype(float))
+            values = measured.measured[..., i].astype(float)
+            output = ChannelRecords(about.names[i], about.units[i], values)
             drawn.append(Errors(output, dict(zip(reversed(KEYS), reversed(pair), strict=True))))
     commands = [
         ChannelRecords(name, "", measured.commands[..., j].astype(float))

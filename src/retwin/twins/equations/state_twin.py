@@ -130,12 +130,11 @@ class StateTwin(AdjustableTwin):
             got="both" if self.step else "neither",
             remedy="give the time derivatives of the states, or the states one sample later",
         )
-        names = list(self.names)
-        require(
-            len(set(names)) == len(names),
+        twice = sorted({name for name in self.names if list(self.names).count(name) > 1})
+        nothing(
             "parameters",
-            expected="different names of parameters and states",
-            got=", ".join(names),
+            [f"{name} twice" for name in twice],
+            "different names of parameters and states",
             remedy="the start of a state is the parameter start_NAME; rename the other",
         )
         sample_rate("rate", self.rate)

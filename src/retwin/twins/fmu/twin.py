@@ -10,9 +10,9 @@ import os
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import asdict, dataclass, field
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,7 +36,7 @@ from retwin.twins.fmu.model import (
 from retwin.twins.limits import Limits
 from retwin.twins.time_step import steps_per_sample
 from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks
-from retwin.twins.workers import worker_processes
+from retwin.twins.workers import keep_workers, worker_processes
 from retwin.workers.isolation import IsolatedPool
 from retwin.workers.pools import scratch_folder
 from retwin.workers.process import Frame, ProcessEnded
@@ -241,22 +241,21 @@ class FMUTwin:
             if progress is not None:
                 progress(min(1.0, finished / count))
 
-        with ExitStack() as stack:
+        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             # No process is started before commands and faults are found good.
-            pool = cache(lambda: stack.enter_context(self._workers(count)))
-
-            def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-                made = self._run(pool(), chunk, values[chunk.index], report, ended)
-                notes.update(dict.fromkeys(pool().notes))
+            with self._workers(count) as pool:
+                made = self._run(pool, chunk, values[chunk.index], report, ended)
+                notes.update(dict.fromkeys(pool.notes))
                 return made
 
-            try:
-                size = TRAJECTORIES_PER_CHUNK
+        size = TRAJECTORIES_PER_CHUNK
+        try:
+            with keep_workers():
                 return simulate_in_chunks(
                     self, run, commands, faults, seed=seed, progress=None, size=size
                 )
-            finally:
-                self._warn(notes, ended)
+        finally:
+            self._warn(notes, ended)
 
     def _warn(self, notes: Collection[str], ended: Mapping[int, float]) -> None:
         """Warn once of an FMU that does not restore its state, and of runs that ended early."""

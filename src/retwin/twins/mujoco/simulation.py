@@ -13,8 +13,7 @@ import numpy as np
 from mujoco import batch as mujoco_batch
 from numpy.typing import NDArray
 
-from retwin.checks import require
-from retwin.errors import InputError
+from retwin.checks import given, require
 from retwin.twins.mujoco.actuators import FILTERS, joint_of, resting
 from retwin.twins.mujoco.parameters import set_parameter
 
@@ -210,14 +209,10 @@ class MuJoCoSimulation:
     def _lockable(self, actuator: int) -> int:
         """The degree of freedom that is locked when an actuator is stuck."""
         name = self.inputs[actuator]
-        joint = joint_of(self.model, name)
-        if joint is None:
-            raise InputError(
-                "faults",
-                expected="a stuck actuator that drives a hinge or slide joint",
-                got=f"{name}, which drives something else",
-                remedy="give the fault to another actuator, or model it as a command fault",
-            )
+        expected = "a stuck actuator that drives a hinge or slide joint"
+        got = f"{name}, which drives something else"
+        remedy = "give the fault to another actuator, or model it as a command fault"
+        joint = given("faults", joint_of(self.model, name), expected, got=got, remedy=remedy)
         require(
             self.model.opt.integrator != int(mujoco.mjtIntegrator.mjINT_RK4),
             "faults",

@@ -1,8 +1,10 @@
-"""Values of parameters that differ between simulations, and the base of twins that take them."""
+"""Values of parameters that differ between simulations, and twins that take them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,8 @@ from retwin.checks import one_of, require
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault
-from retwin.twins.twin import checked_commands, simulate_in_chunks
+from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
+from retwin.twins.wrappers.wrapper import TwinWrapper, simulate_chunk
 
 
 def values_per_simulation(
@@ -87,3 +90,62 @@ class AdjustableTwin:
         return simulate_in_chunks(
             twin, twin._run, commands, faults, seed=seed, progress=progress, **how
         )
+
+
+@dataclass(frozen=True)
+class RebuiltTwin(AdjustableTwin, TwinWrapper):
+    """A twin that is built anew for each combination of parameter values.
+
+    Trajectories with equal values are simulated together.
+
+    Parameters
+    ----------
+    build : callable
+        From values by name to a twin, whose channels, rate and limits do not depend on them.
+        Other processes must be able to import it.
+    defaults : mapping of str to float
+        Values of all parameters.
+
+    """
+
+    build: Callable[[Mapping[str, float]], Twin]
+    defaults: Mapping[str, float]
+
+    @cached_property
+    def twin(self) -> Twin:
+        """The twin at the defaults.
+
+        Raises
+        ------
+        InputError
+            `build` returns no twin.
+
+        """
+        made = self.build(dict(self.defaults))
+        require(
+            isinstance(made, Twin),
+            "build",
+            expected="a function that returns a twin",
+            got=type(made).__name__,
+            remedy="return a FunctionTwin, or any object that satisfies Twin",
+        )
+        return made
+
+    @property
+    def _adjustable(self) -> tuple[str, ...]:
+        return tuple(self.defaults)
+
+    def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
+        """Nominal and observed outputs."""
+        count, steps, _ = chunk.commands.shape
+        columns = {name: np.full(count, value) for name, value in self.defaults.items()}
+        columns |= chunk.parameters
+        nominal = np.zeros((count, steps, len(self.outputs)))
+        observed = np.zeros_like(nominal)
+        table = np.stack(list(columns.values()), 1)
+        distinct, group = np.unique(table, axis=0, return_inverse=True)
+        for i, theta in enumerate(distinct):
+            rows = np.flatnonzero(group.ravel() == i)
+            twin = self.build(dict(zip(columns, theta.tolist(), strict=True)))
+            nominal[rows], observed[rows] = simulate_chunk(twin, chunk, rows, seed=chunk.seed)
+        return nominal, observed

@@ -20,7 +20,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.twin import Twin
-from retwin.twins.wrappers.rebuilt import RebuiltTwin
+from retwin.twins.wrappers.parameter_values import RebuiltTwin
 from retwin.twins.wrappers.wrapper import TwinWrapper
 
 
@@ -57,6 +57,12 @@ class TakesParameters(Twin, Protocol):
             As `Twin.simulate`, and for unknown parameters and values that are not finite.
 
         """
+
+
+def takes_parameters(twin: Twin) -> bool:
+    """Whether the `simulate` of a twin takes values of parameters."""
+    accepted = signature(twin.simulate).parameters.values()
+    return any(each.name == "parameters" or each.kind == each.VAR_KEYWORD for each in accepted)
 
 
 @dataclass(frozen=True)
@@ -145,9 +151,8 @@ class ParametricTwin(TwinWrapper):
     held: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        accepted = signature(self.twin.simulate).parameters.values()
         require(
-            any(each.name == "parameters" or each.kind == each.VAR_KEYWORD for each in accepted),
+            takes_parameters(self.twin),
             "twin",
             expected="one whose simulate takes values of its parameters",
             got=type(self.twin).__name__,

@@ -30,10 +30,8 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
     for each in path.glob("*.db3") if path.is_dir() else [path]:
         if each.suffix.lower() == ".db3":
             _check_database(each)
-    if ros1:
-        reader = needs_extra("rosbags.rosbag1", "logs", "reads ROS bags").Reader(path)
-    else:
-        reader = needs_extra("rosbags.rosbag2", "logs", "reads ROS bags").Reader(path)
+    version = f"rosbags.rosbag{1 if ros1 else 2}"
+    reader = needs_extra(version, "logs", "reads ROS bags").Reader(path)
     types, series = Types(), Series(wanted, clock)
     formats = rosbags.MessageDefinitionFormat
     with reader:

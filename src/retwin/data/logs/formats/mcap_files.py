@@ -41,7 +41,12 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
                     decode = partial(_decode, types, schema, channel, message.data)
                     series.add(channel.topic, str(channel.id), message.log_time, decode)
         except (exceptions.EndOfFile, struct.error):
-            raise _cut_off(path) from None
+            raise InputError(
+                path.name,
+                expected="an MCAP file that is whole",
+                got="one that is cut off",
+                remedy=f"recover it: mcap recover {path.name} -o recovered.mcap",
+            ) from None
     yield from series.found()
 
 
@@ -60,12 +65,3 @@ def _decode(types: Types, schema: Any, channel: Any, data: bytes) -> Any:
         text = schema.data.decode("utf-8", "replace")
         name = types.define(name, text, idl=DEFINED[schema.encoding])
     return types.decode(data, name, ros1=encoding == "ros1")
-
-
-def _cut_off(path: Path) -> InputError:
-    return InputError(
-        path.name,
-        expected="an MCAP file that is whole",
-        got="one that is cut off",
-        remedy=f"recover it: mcap recover {path.name} -o recovered.mcap",
-    )
