@@ -508,7 +508,8 @@ def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
     if void:
         text += (
             f"; in {len(void)} of {len(record)} records the promise is VOID, since {min(void):.6g} "
-            "s: the machine is not the one of the calibration. "
+            "s: the machine is not the one of the calibration, and is watched as it has become. A "
+            "fault that stays raises no further alarm. "
             + (
                 "Look for the causes of the events first: a calibration with this record would "
                 "take the fault for healthy"

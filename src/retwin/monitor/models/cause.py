@@ -99,7 +99,9 @@ def cause_text(cause: Mapping[str, Any], since: str) -> str:
     """
     known = cause["name"] != HEALTHY  # else it explains the alarm best, which has no known cause
     more = cause["unknown"] > PROBABLE and known
-    text = (cause["name"] if known else "no known fault") + (f" from {since}" if since else "")
+    doubt = "not clear, most likely " * (known and cause["probability"] < PROBABLE)
+    name = doubt + cause["name"] if known else "no known fault"
+    text = name + (f" from {since}" if since else "")
     text += ", and more than that" if since and more else ""
     value, low, high = cause["size"]
     of = f" {cause['unit']}" if cause["unit"] not in ("", "1") else ""
@@ -199,9 +201,7 @@ def _any_change(twin: DynamicsTwin) -> dict[str, TimedFault]:
     for i in np.flatnonzero(moved).tolist():
         name = f"{twin.inputs.names[i]}: another effect"
         made[name] = ActuatorGain(actuator=i, size=(-1.0, 1.0))
-    commands, unseen = twin.domain.mean[None, None, states:], np.zeros((1, 1, len(twin.noise)))
-    spread = twin.filter(commands, unseen, unseen.astype(bool), known_start=False)[1][0, 0]
-    for i, range_ in enumerate(np.sqrt(12 * np.diagonal(spread)).tolist()):
+    for i, range_ in enumerate(output_ranges(twin)):
         name, rate = twin.outputs.names[i], range_ * twin.rate / BEFORE
         made[f"{name}: sensor offset"] = SensorBias(
             output=i, size=(-OFFSET * range_, OFFSET * range_)
@@ -209,6 +209,14 @@ def _any_change(twin: DynamicsTwin) -> dict[str, TimedFault]:
         made[f"{name}: sensor drift"] = SensorDrift(output=i, size=(-rate, rate))
         made[f"{name}: sensor frozen"] = SensorFreeze(output=i)
     return made
+
+
+def output_ranges(twin: DynamicsTwin) -> list[float]:
+    """Widths of uniform distributions of the outputs where states are as in calibration."""
+    commands = twin.domain.mean[None, None, len(twin.process) :]
+    unseen = np.zeros((1, 1, len(twin.noise)))
+    spread = twin.filter(commands, unseen, unseen.astype(bool), known_start=False)[1][0, 0]
+    return np.sqrt(12 * np.diagonal(spread)).tolist()
 
 
 def find_causes(

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.monitor.models.cause import size_unit
+from retwin.monitor.models.cause import output_ranges, size_unit
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.watched import SHARE, Visible
 from retwin.progress import Progress, tracked
@@ -27,6 +27,7 @@ from retwin.twins.faults.actuator_faults import Fault, Stuck
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
     ParameterFault,
+    SensorBias,
     SensorError,
     SensorFreeze,
     SizedFault,
@@ -85,7 +86,8 @@ def visible_sizes(
         if np.isfinite(share):  # of a fault that the twin can simulate
             unit = size_unit(fault, monitor.twin)
             value = _value_behind(fault, monitor.twin)
-            made.append(Visible(name, best, largest, share, within, unit, value))
+            compared = "range" if isinstance(fault, SensorBias) else "value"
+            made.append(Visible(name, best, largest, share, within, unit, value, compared))
     return made
 
 
@@ -109,6 +111,8 @@ def _value_behind(fault: Fault | None, twin: DynamicsTwin) -> float | None:
     if isinstance(fault, ParameterFault) and not fault.grows:
         values = dict(zip(twin.equations.names, twin.values.tolist(), strict=True))
         return values.get(fault.parameter)
+    if isinstance(fault, SensorBias):
+        return output_ranges(twin)[fault.output]
     return 1.0 if isinstance(fault, ActuatorGain) else None
 
 

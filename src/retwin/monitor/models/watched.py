@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.monitor.detect.promise import duration
 from retwin.monitor.models.monitor_state import MonitorState
 
 
@@ -165,8 +166,10 @@ class Visible:
     unit : str
         Of the sizes; "" where there are none.
     value : float or None
-        What is changed by a size as large as itself: a parameter, or 1 for a command; None where a
-        size is compared with nothing.
+        What a size is compared with: the parameter, 1 for a command, the range of the output in
+        calibration; None where it is nothing.
+    compared : str
+        The name of that.
 
     """
 
@@ -177,6 +180,7 @@ class Visible:
     within: float
     unit: str = ""
     value: float | None = None
+    compared: str = "value"
 
     @property
     def hidden(self) -> bool:
@@ -191,7 +195,7 @@ class Visible:
         of = f" {self.unit}" if self.unit not in ("", "1") else ""
         text = f"{abs(self.size or 0.0):.3g}{of}"
         if self.size is not None and self.value and self.value != 1:
-            text += f", {abs(self.size / self.value):.0%} of the value"
+            text += f", {abs(self.size / self.value):.0%} of the {self.compared}"
         return text
 
     def __str__(self) -> str:
@@ -205,4 +209,4 @@ class Visible:
             )
         else:
             what = "seen" if self.size is None else f"seen from a size of {self.shown_size}"
-        return f"{self.fault}: {what} ({self.share:.0%} within {self.within:.3g} s)"
+        return f"{self.fault}: {what} ({self.share:.0%} within {duration(self.within)})"
