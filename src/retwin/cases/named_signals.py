@@ -15,7 +15,7 @@ from retwin.data.logs.mapping import ChannelMapping, Cut, TimeSettings
 from retwin.data.logs.mapping import Mapping as LogMapping
 from retwin.data.logs.proposal import channel_mapping, cut_at_pauses, shortest_pause
 from retwin.data.logs.signals import UNWANTED, Log, named_unit
-from retwin.data.resampling import longest_bridge
+from retwin.data.resampling import is_sparse, longest_bridge
 from retwin.data.tables import EVEN, TIMES
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
@@ -251,6 +251,8 @@ def mapping_by_names(log: Log, twin: Twin, named: Mapping[str, str], *, table: b
             changes: dict[str, Any] = {"unit": unit if unit != "1" else None}
             if table:
                 changes |= {"resample": None, "max_gap": None}
+            if table and kind == "outputs" and is_sparse(signal.times, 1 / twin.rate):
+                changes["resample"] = "none"
             if table and kind == "commands":
                 held = min(proposed.max_gap or math.inf, shortest_pause(1 / twin.rate))
                 changes["max_gap"] = max(held, longest_bridge(signal.times, 1 / twin.rate))
@@ -317,4 +319,6 @@ def resampling_of(log: Log, mapping: LogMapping, rate: float, *, rounded: float 
     low, high = min(own), max(own)
     shown = f"{low:.4g}" if high < (1 + rounded) * low else f"{low:.4g} to {high:.4g}"
     rows = f", commands are held where rows are left out, for {held:.2g} s at most" if held else ""
+    if any(each.resample == "none" for each in mapping.outputs.values()):
+        rows = f", outputs are left open between these{rows}"
     return f"{where}values at {shown} Hz (median) are brought to {rate:g} Hz{rows}"
