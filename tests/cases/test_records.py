@@ -58,6 +58,16 @@ def test_irregular_rows_come_to_the_sample_rate(tmp_path: Path) -> None:
     )
 
 
+def test_outputs_are_left_open_between_rows_that_are_fewer_than_the_samples(tmp_path: Path) -> None:
+    """Interpolated samples hold no information, and show no noise."""
+    time = 0.5 * np.arange(20)
+    write(tmp_path / "first.csv", time, time > 4, 3 * time, 3 * time)
+    made = read(tmp_path)
+    assert np.flatnonzero(made.mask[0].all(axis=1)).tolist() == list(range(0, made.steps, 5))
+    np.testing.assert_allclose(made.observed[0, ::5, 0], 3 * time, atol=1e-9)
+    assert np.isfinite(made.commands).all()
+
+
 @pytest.mark.parametrize(
     ("unit", "times"),
     [

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from retwin.cases.time_column import TimeColumn
 from retwin.checks import finite, require
+from retwin.data.resampling import Resampling, is_sparse
 from retwin.data.tables import Table, read_titled
 from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError
@@ -275,18 +276,19 @@ def record_in(
     seconds = np.empty(0) if clock is None else clock.seconds(table, rows, rate, name)
     count = len(range(table.rows)[rows])
 
-    def values(channels: Channels, held: bool) -> NDArray:
+    def values(channels: Channels, how: Resampling) -> NDArray:
         columns = [
             np.mean([table.cells(each)[rows] for each in several], axis=0)
             for several in record.columns_of(channels)
         ]
         found = np.array(columns).T.reshape(count, len(channels))
         if clock is not None:
-            found = clock.resample(seconds, found, rate, held=held)
+            found = clock.resample(seconds, found, rate, how)
         return found[None]
 
-    held = clock is not None and clock.commands == "hold"
-    commands, observed = values(twin.inputs, held), values(twin.outputs, False)
+    sparse = clock is not None and is_sparse(seconds, 1 / rate)
+    commands = values(twin.inputs, "hold" if clock is None else clock.commands)
+    observed = values(twin.outputs, "none" if sparse else "linear")
     # Without commands, a record ends where its measurements end.
     known = np.isfinite(commands[0]).all(axis=1)
     ends = known if len(twin.inputs) else np.isfinite(observed[0]).any(axis=1)

@@ -110,13 +110,9 @@ class TimeColumn:
         )
         return elapsed
 
-    def resample(self, seconds: NDArray, values: NDArray, rate: float, *, held: bool) -> NDArray:
-        """Values (T, d) at times (T,) in s, as samples (N, d) at a rate in Hz; NaN where missing.
-
-        `held` values are constant until the next, others change along straight lines.
-        """
+    def resample(self, seconds: NDArray, values: NDArray, rate: float, how: Resampling) -> NDArray:
+        """Values (T, d) at times (T,) in s, as samples (N, d) at a rate in Hz; NaN if missing."""
         grid = np.arange(int((seconds[-1] + SAME / rate) * rate) + 1) / rate
         longest = self.max_gap or longest_bridge(seconds, 1 / rate)
-        how: Resampling = "hold" if held else "linear"
         columns = [resample(seconds, v, grid, 1 / rate, how, longest=longest) for v in values.T]
         return np.array(columns).reshape(len(values.T), len(grid)).T
