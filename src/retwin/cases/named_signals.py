@@ -207,8 +207,8 @@ def _find_channels(
         log.name,
         expected=f"a {what} for {wanted}",
         got=f"{all_of} {_list(log.signals)}{lacking}",
-        remedy="name it in [logs] of the case, as retwin identify --column does, or give a "
-        "mapping: retwin data map LOG --case TWIN --out mapping.toml",
+        remedy=f"name it: retwin identify --column {(*missing, *twin.outputs.names)[0]}=NAME, or "
+        "[logs] of the case; or give a mapping: retwin data map LOG --case TWIN --out mapping.toml",
     )
     return found
 

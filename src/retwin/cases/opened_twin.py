@@ -203,9 +203,13 @@ def _parameter(text: str, by_name: dict[str, Known], known: Sequence[Known]) -> 
         require(
             found.ranged,
             "--free",
-            expected=f"a range for {name}, since the twin states none" if name in by_name else FORM,
+            expected=f"a range for {name}, since the twin states none"
+            if name in by_name
+            else f"a parameter of the twin, as {FORM}",
             got=repr(text),
-            remedy=f"write --free {name or 'NAME'}=LOW:HIGH; {_list(known)}",
+            remedy=f"write --free {name}=LOW:HIGH; {_list(known)}"
+            if name in by_name
+            else f"check the spelling: {_list(known)}",
         )
         return found.parameter
     try:
