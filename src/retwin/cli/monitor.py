@@ -165,6 +165,7 @@ def replay(
 ) -> None:
     """Watch recorded data as if they came now: alarms, their causes, and the promise."""
     from retwin.monitor import Monitor
+    from retwin.update.forecast_errors import warn_unlike
 
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     if kind_of(saved(monitor)) == "trajectory_monitor":
@@ -175,6 +176,7 @@ def replay(
     found, rows = [], list[str]()
     for file in logs:
         record = reading(file, system or _named(made.twin))
+        warn_unlike(made.twin, record)
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
         found.append((file, record, watched, causes))
