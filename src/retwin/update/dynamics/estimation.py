@@ -237,7 +237,8 @@ class Estimation:
         mean, precision = self._prior
         prior = precision * (flat - mean)
         if not at.finite:
-            return np.inf, prior, self._curvature(at)
+            with np.errstate(over="ignore", invalid="ignore"):
+                return np.inf, prior, self._curvature(at)
         squares = np.sum(at.residual**2, axis=(0, 1))
         value = 0.5 * float((1 / self.variance) @ squares + prior @ (flat - mean))
         if self.absorbed is not None:
