@@ -15,6 +15,7 @@ import retwin as rt
 from retwin.cli.monitor import _event_rows
 from retwin.monitor import Alarm, Monitor
 from retwin.monitor.models.cause import Cause, cause_text
+from retwin.monitor.models.watched import Visible
 from retwin.twins import ParameterShift
 from retwin.update import DynamicsTwin, StationaryNoise
 
@@ -48,6 +49,8 @@ def test_a_cause_is_written_with_its_time_size_and_probability_where_it_has_them
         "leaking from 2 s, and more than that; size 0.2 (0.1 to 0.3), "
         "probability 0.70 among the known causes"
     )
+    unclear = replace(leaking, probability=0.4)
+    assert cause_text(vars(unclear), "2 s").startswith("not clear, most likely leaking from 2 s;")
     frozen = replace(leaking, size=nothing, unit="")
     assert cause_text(vars(frozen), "2 s") == "leaking from 2 s; probability 0.70"
 
@@ -70,7 +73,7 @@ def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:
     assert row[-1][0].startswith("leaking from 2.0 s; size")
     assert "again, or still, 1 time until 9 s, then leaking from 2.0 s" in row[-1][1]
     rows = _event_rows(both, [found, other], 1.0)  # type: ignore[arg-type]
-    assert [each[-1][0][:9] for each in rows] == ["leaking f", "weak pump"]
+    assert [each[-1][0][:9] for each in rows] == ["leaking f", "not clear"]
     remark = SimpleNamespace(events=[replace(first, promised=False)], endings=[])
     (row,) = _event_rows(remark, [found], 1.0)  # type: ignore[arg-type]
     assert row[-2].startswith("remark: ")
@@ -175,6 +178,43 @@ def test_a_black_box_keeps_the_case_that_its_records_are_read_by(
     code, printed, err = call("monitor", "replay", out, file, "--json")
     assert code == 0, err
     assert json.loads(printed)["records"][0]["measured_samples"] == 2 * steps
+
+
+def test_an_output_that_slowly_leaves_its_range_is_named_without_an_alarm(
+    watched: Path, call, tmp_path: Path
+) -> None:
+    """The filter follows it, so that errors of one step do not show it."""
+    healthy = rt.load(watched / "healthy.npz")
+    made = Monitor.load(watched / "watch")
+    assert made.leaving(healthy) == {}
+    width = float(np.ptp(healthy.observed))
+    ramp = np.linspace(0, 1, healthy.steps)[None, :, None]
+    away = healthy.replace(observed=healthy.observed + 2 * width * ramp)
+    ((name, (first, value, low, high)),) = made.leaving(away).items()
+    assert name == "level"
+    assert value == pytest.approx(float(away.observed.max()))
+    assert value > high + width > low
+    before = away.observed[0, : round(first * away.rate), 0]
+    assert (before < high + 0.26 * (high - low)).all()
+    rt.save(away, tmp_path / "away.npz")
+    code, printed, err = call("monitor", "replay", watched / "watch", tmp_path / "away.npz")
+    assert code == 0, err
+    assert "Outputs leave the range of the calibration: level" in " ".join(printed.split())
+
+
+def test_a_monitor_that_sees_sensors_at_most_says_so(
+    watched: Path, call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from retwin import monitor
+
+    sensor = Visible("level: sensor offset", 0.1, 1.0, 1.0, 5.0, "m", 1.0, "range")
+    given = ("monitor", "fit", watched / "model", watched / "healthy.npz")
+    for size, said in ((0.02, False), (0.2, True)):
+        leak = Visible("leak changed", size, 0.5, 1.0, 5.0, "1/s", 0.1)
+        monkeypatch.setattr(monitor, "visible_sizes", lambda *_, **__: [leak, sensor])  # noqa: B023
+        code, _, err = call(*given, "--false-alarms", "1 per day", "--out", tmp_path / f"{said}")
+        assert code == 0, err
+        assert ("filter follows them as disturbances" in err) is said
 
 
 def test_what_cannot_calibrate_leaves_nothing(watched: Path, call, tmp_path) -> None:

@@ -229,7 +229,8 @@ def _parameter(text: str, by_name: dict[str, Known], known: Sequence[Known]) -> 
         "--free",
         expected=f"a range of {name} that contains its present value, {begin}",
         got=given,
-        remedy=f"widen the range, or give another start: --free {name}={low:g}:{high:g}:START",
+        remedy=f"widen the range, or give another start: --free {name}={low:g}:{high:g}:START; to "
+        "hold a parameter, name the others alone",
     )
     return Parameter(name, found.unit, low, high, begin)
 

@@ -7,6 +7,7 @@ import secrets
 import signal
 import tempfile
 import threading
+import warnings
 import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
@@ -151,7 +152,18 @@ def fit(
         *map(str, made.visible),
         as_json=as_json,
     )
+    changes = [each.hidden for each in made.visible if each.compared == "value" and each.value]
+    if changes and all(changes):
+        warnings.warn(BLIND, stacklevel=1)
     note(f"Saved {out}")
+
+
+BLIND = (
+    "this monitor sees no change of a parameter, or of the effect of a command, by less than all "
+    "of it: its filter follows them as disturbances. Compare free simulations of new records too: "
+    "retwin evaluate MODEL --real LOG"
+)
+"""What is said of a monitor that detects faults of sensors at most."""
 
 
 @app.command(epilog=example("retwin monitor replay watch day1.npz day2.npz"))
@@ -190,7 +202,7 @@ def replay(
             "records": [_json(*each) for each in found],
         },
         *rows,
-        *(_summary(*each[:3]) for each in found),
+        *(_summary(made, *each[:3]) for each in found),
         _rates(made, [(each[1], each[2]) for each in found]),
         as_json=as_json,
     )
@@ -496,7 +508,7 @@ def _describe_event(record: str, begin: str, end: str, what: str, causes: Sequen
     return "\n    ".join([f"{record}, from {begin} s{until}: {what}", *causes])
 
 
-def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
+def _summary(monitor: Monitor, file: Path, record: Trajectories, watched: Watched) -> str:
     """What was watched, and whether the promise applied."""
     from retwin.report.labels import counted
 
@@ -523,6 +535,16 @@ def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
         text += (
             f"; in {int(watched.outside.sum())} of {len(record)} records commands leave the range "
             "of the calibration, where the twin extrapolates and nothing is promised"
+        )
+    outputs = [
+        f"{name}, {low:.4g} to {high:.4g} there, reaches {value:.4g} (outside from {first:.6g} s)"
+        for name, (first, value, low, high) in monitor.leaving(record).items()
+    ]
+    if outputs:
+        text += (
+            f". Outputs leave the range of the calibration: {'; '.join(outputs)}. No alarm follows "
+            "from that alone, since the filter follows slow changes: compare a free simulation, "
+            "retwin evaluate MODEL --real LOG"
         )
     return text + "."
 

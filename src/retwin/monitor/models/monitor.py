@@ -36,7 +36,10 @@ from retwin.monitor.models.watched import Alarm, Ending, Part, Visible, Watched
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.filter.online import OnlineFilter
 from retwin.update.dynamics.twin import BEYOND, DynamicsTwin
+from retwin.update.forecast_errors import range_excess
 
+FAR = 0.25
+"""Share of the width of its range by which an output that leaves it is named."""
 SIZE = 256
 """Samples that are predicted at once: those after an alarm are predicted again. While an event
 lasts, where alarms are frequent, an eighth of them."""
@@ -370,6 +373,33 @@ class Monitor:
         margin = BEYOND * (largest - least)
         low, high = np.minimum(low, least - margin), np.maximum(high, largest + margin)
         return np.asarray(((commands < low) | (commands > high)).any(axis=2))
+
+    def leaving(self, record: Trajectories) -> dict[str, tuple[float, float, float, float]]:
+        """Outputs that leave their range in both calibrations by a quarter of its width.
+
+        The filter follows what changes slowly, so that errors of one step do not show it.
+
+        Returns
+        -------
+        dict of str to tuple of float
+            By output, the time in s at which one does first, the furthest value, and the range.
+
+        """
+        count = len(self.twin.outputs)
+        low, high = self.noise.low[-count:], self.noise.high[-count:]
+        if self.twin.forecast is not None:
+            low = np.minimum(low, self.twin.forecast.low[-count:])
+            high = np.maximum(high, self.twin.forecast.high[-count:])
+        found = {}
+        for i, name in enumerate(self.twin.outputs.names):
+            own = np.where(record.mask[..., i], record.observed[..., i], np.nan)
+            excess = range_excess(own[..., None], low[[i]], high[[i]])
+            row, furthest = np.unravel_index(np.argmax(excess), excess.shape)
+            if excess[row, furthest] > FAR:
+                first = float(np.argmax(excess[row] > FAR)) / record.rate
+                ends = float(low[i]), float(high[i])
+                found[name] = (first, float(own[row, furthest]), *ends)
+        return found
 
     @cached_property
     def _filters(self) -> tuple[OnlineFilter, ...]:
