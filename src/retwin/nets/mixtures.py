@@ -104,9 +104,11 @@ class GaussianMixture(MixtureSameFamily, Block):
         weights = self.mixture_distribution.probs
         cumulative = weights.cumsum(dim=-1)
         chosen = (uniform[..., None] >= cumulative).sum(dim=-1).clamp_max(weights.shape[-1] - 1)
-        place = chosen[..., None, None]
-        mean = torch.take_along_dim(self.means, place, -2)[..., 0, :]
-        factor = torch.take_along_dim(self.factor, place[..., None], -3)[..., 0, :, :]
+        # `take_along_dim` would fix the number of samples in a graph that is exported.
+        size, place = normal.shape[-1], chosen[..., None, None]
+        mean = self.means.gather(-2, place.expand(*chosen.shape, 1, size))[..., 0, :]
+        place = place[..., None].expand(*chosen.shape, 1, size, size)
+        factor = self.factor.gather(-3, place)[..., 0, :, :]
         return mean + (factor @ normal[..., None])[..., 0]
 
     def widened(self, factor: Tensor) -> GaussianMixture:
