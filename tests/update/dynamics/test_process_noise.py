@@ -132,14 +132,3 @@ def test_it_is_saved_and_a_model_without_it_is_refused(twin: DynamicsTwin, tmp_p
     save_file(weights, file)
     with pytest.raises(rt.InputError, match="proportional"):
         DynamicsTwin.load(tmp_path / "model")
-
-
-def test_whole_records_are_left_out_where_there_are_enough() -> None:
-    """What differs between records must not be learned from the samples beside those left out."""
-    several = folds(np.ones((7, 50, 1), dtype=bool), 10)
-    assert [sorted(np.flatnonzero(part.any(axis=1))) for part in several] == [[k] for k in range(7)]
-    assert all(part[part.any(axis=1)].all() for part in several)
-    few = folds(np.ones((4, 50, 1), dtype=bool), 10)
-    assert all((part.sum(axis=1) == 5).all() for part in few)
-    for parts in (several, few):
-        assert (np.sum(parts, axis=0) == 1).all()

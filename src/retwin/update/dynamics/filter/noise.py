@@ -21,8 +21,6 @@ __all__ = ["edges", "fit_noise", "folds", "needed_factor", "widening"]
 
 CERTAIN = 1.645
 """Standard errors between a quantile of held-out samples and its upper 95 % limit."""
-RECORDS = 5
-"""Trajectories from which on whole ones are left out: of fewer, signed ranks show nothing."""
 ENOUGH = 10_000
 """Number of samples from which the likelihood is computed, unless one trajectory has more. They
 determine a variance to 1.4 %, and bands are scaled to all samples."""
@@ -107,20 +105,14 @@ def _predict(
 
 
 def folds(seen: NDArray, count: int) -> list[NDArray]:
-    """Parts (n, T) of the record: whole trajectories, or else blocks of samples of each.
+    """Parts (n, T) of the record: each trajectory is cut into `count` blocks of samples.
 
-    Where there are enough trajectories, each part is of whole ones: what differs between them, such
-    as the weather of a day, would else be learned from the samples beside those that are left out.
-    Otherwise a fold has one block of each trajectory, another one in each, so
-    that it holds all phases of a record without holding out the start of all trajectories.
+    A fold has one block of each trajectory, another one in each, so that it holds all phases of a
+    record without holding out the start of all trajectories.
     """
     trajectories, samples, _ = seen.shape
-    place = np.arange(trajectories)[:, None]
-    if trajectories >= RECORDS:
-        count = min(count, trajectories)
-        own = np.broadcast_to(place % count, seen.shape[:2])
-    else:
-        own = (np.arange(samples) * count // samples + place) % count
+    block = np.arange(samples) * count // samples
+    own = (block + np.arange(trajectories)[:, None]) % count
     return [own == fold for fold in range(count)]
 
 
