@@ -186,11 +186,11 @@ def test_an_output_that_slowly_leaves_its_range_is_named_without_an_alarm(
     """The filter follows it, so that errors of one step do not show it."""
     healthy = rt.load(watched / "healthy.npz")
     made = Monitor.load(watched / "watch")
-    assert made.leaving(healthy) == {}
+    assert made.find_excursions(healthy) == {}
     width = float(np.ptp(healthy.observed))
     ramp = np.linspace(0, 1, healthy.steps)[None, :, None]
     away = healthy.replace(observed=healthy.observed + 2 * width * ramp)
-    ((name, (first, value, low, high)),) = made.leaving(away).items()
+    ((name, (first, value, low, high)),) = made.find_excursions(away).items()
     assert name == "level"
     assert value == pytest.approx(float(away.observed.max()))
     assert value > high + width > low

@@ -204,11 +204,7 @@ def evaluate(
         table(heads, rows, numbers=heads[2:6]),
         *_verdict(scores),
         *fitted_remarks(model, records, "these are no scores of new ones"),
-        *(
-            []
-            if ahead or begin or _foreign(scores)
-            else _start_remarks(updated, records, scores, units, seed)
-        ),
+        *([] if ahead or begin else _start_remarks(updated, records, scores, units, seed)),
         as_json=as_json,
     )
     if out is not None:
@@ -296,8 +292,8 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
 
     own, foreign = {each.output: each for each in scores if each.who == "model"}, _foreign(scores)
     made = [
-        f"{name}: the model is wrong by more than {FOREIGN:g} times what this record varies, and "
-        "its band holds nothing of it. Look first for another unit, another column, or another "
+        f"{name}: the RMSE is over {FOREIGN:g} times the standard deviation of this record, and "
+        "hardly a sample is in the band. Look first for another unit, another column, or another "
         "machine than that of the calibration; judge one that integrates some time ahead, by "
         "--horizon."
         for name in foreign

@@ -538,7 +538,7 @@ def _summary(monitor: Monitor, file: Path, record: Trajectories, watched: Watche
         )
     outputs = [
         f"{name}, {low:.4g} to {high:.4g} there, reaches {value:.4g} (outside from {first:.6g} s)"
-        for name, (first, value, low, high) in monitor.leaving(record).items()
+        for name, (first, value, low, high) in monitor.find_excursions(record).items()
     ]
     if outputs:
         text += (

@@ -374,7 +374,7 @@ class Monitor:
         low, high = np.minimum(low, least - margin), np.maximum(high, largest + margin)
         return np.asarray(((commands < low) | (commands > high)).any(axis=2))
 
-    def leaving(self, record: Trajectories) -> dict[str, tuple[float, float, float, float]]:
+    def find_excursions(self, record: Trajectories) -> dict[str, tuple[float, float, float, float]]:
         """Outputs that leave their range in both calibrations by a quarter of its width.
 
         The filter follows what changes slowly, so that errors of one step do not show it.

@@ -27,7 +27,7 @@ LASTING = 0.5
 effect, from which a plant counts as integrating or unstable. That of a stable plant decays."""
 OVERFITTED = 2.0
 """Ratio of the errors of parts of a record that were left out to those of the fit, from which on
-the parameters of whole records are no good ones."""
+the parameters of whole records count as overfitted."""
 
 Fit = Callable[[Trajectories, int | None], ParametricTwin]
 """Fits a twin to measurements, in windows of so many samples or None for whole records."""
@@ -126,7 +126,7 @@ class HeldOut:
         spread[~self.observed.mask.any(axis=(0, 1))] = np.nan
         return spread
 
-    def fitted(self, length: int | None) -> list[ParametricTwin | None]:
+    def fit_without(self, length: int | None) -> list[ParametricTwin | None]:
         """The twins without each part, from windows of a length; None where a simulation fails."""
         made: list[ParametricTwin | None] = []
         for part in self.parts:
@@ -199,8 +199,8 @@ def choose_length(held: HeldOut, whole: Sequence[ParametricTwin | None] | None) 
     lengths: list[int | None] = [*([] if whole is None else [None]), *horizons]
     if len(lengths) < 2:
         return [Candidate(each, 1.0, 0.0) for each in lengths]
-    fits = [whole if each is None else held.fitted(each) for each in lengths]
-    logs = np.stack([held.errors(each or (), horizons) for each in fits])
+    fits = [*([] if whole is None else [whole]), *map(held.fit_without, horizons)]
+    logs = np.stack([held.errors(each, horizons) for each in fits])
     best = np.where(np.isfinite(logs), logs, np.inf).min(axis=0)
     known = np.isfinite(best)
     useful = np.where(known, best, 0.0).sum(axis=0) < 0

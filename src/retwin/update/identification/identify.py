@@ -276,7 +276,7 @@ def _search(
             found = replace(found, lasting=lasts)
             if not choice or not lengths_of(observed):
                 return found
-            whole = held.fitted(None)
+            whole = held.fit_without(None)
             if not (lasts or overfitted(held, residual, whole)):
                 return found
 
