@@ -141,15 +141,15 @@ def test_a_parameter_without_effect_is_an_open_direction() -> None:
     [
         ((0.2, 0.4), "", True, ""),
         ((0.2, 0.8), "", False, "not identified: interval covers 60 % of the range"),
-        ((-0.05, 0.07), "", False, "not shown to differ from an end of its range"),
-        ((0.9, 1.3), "", False, "not shown to differ from an end of its range"),
+        ((-0.05, 0.07), "", False, "not identified: its interval reaches an end of its range"),
+        ((0.9, 1.3), "", False, "not identified: its interval reaches an end of its range"),
         (
             (-3.0, 4.0),
             "",
             False,
             "not identified: interval covers 100 % of the range and leaves it",
         ),
-        ((0.0, 0.002), "", False, "not shown to differ from an end of its range"),
+        ((0.0, 0.002), "", False, "not identified: its interval reaches an end of its range"),
         ((0.99, 1.0), "high", False, "at its upper bound"),
     ],
 )
@@ -183,7 +183,7 @@ def test_an_interval_that_leaves_a_positive_range_is_named() -> None:
     assert coupling.interval is not None
     assert coupling.interval[0] < 0 < coupling.value
     assert checked.open_parameters == ("coupling",)
-    assert state(coupling) == "not shown to differ from an end of its range"
+    assert state(coupling) == "not identified: its interval reaches an end of its range"
     texts = findings(checked)
     assert any("not shown to differ from 0" in each for each in texts)
     assert not any("do not determine" in each for each in texts)

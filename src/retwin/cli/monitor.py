@@ -563,7 +563,7 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     bound = duration(shortest(events, samples) / rate)
     text = f"This replay of {duration(samples / rate)} shows {counted(events, 'event')}"
     if not events:
-        text += f": at most one false event in {bound} (exact 95 %), if the machine was healthy"
+        text += f", which alone bounds their rate at one in {bound} (exact 95 %), if it was healthy"
     text += f". {_describe_promise(monitor)}"
     hidden = [each for each in monitor.visible if each.hidden]
     if hidden and not events:

@@ -195,15 +195,12 @@ class Promise:
 
     def __str__(self) -> str:
         """One sentence for pages, logs and the terminal."""
-        others = "".join(
-            f" (those of slower predictions by {each.kappa:g} and {each.shift:g})"
-            for each in self.slower
-        )
+        others = "".join(f" (of slower predictions {each})" for each in self.slower)
         return (
             f"On average at least {self.arl:.6g} measured samples "
             f"({duration(self.arl / self.rate)}) pass until a false alarm, "
-            "as long as the errors of predictions are distributed as in the calibration, whose "
-            f"quantiles {self.slack}{others}. "
+            "as long as the errors of predictions are distributed as in the calibration, or at "
+            f"most {self.slack}{others}. "
             f"Where that is so, it is declared void with a probability of at most {self.alpha:g}."
         )
 

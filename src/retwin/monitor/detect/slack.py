@@ -48,7 +48,7 @@ class Slack:
         finite("shift", self.shift, at_least=0, at_most=3, unit="standard deviations")
 
     def __str__(self) -> str:
-        return f"may differ by a factor of {self.kappa:g} and by {self.shift:g} standard deviations"
+        return f"{self.kappa:g} times as large, shifted by {self.shift:g} standard deviations"
 
     def upper(self, gaussian: NDArray) -> NDArray:
         """The largest quantiles of the class at Gaussian ones."""

@@ -65,7 +65,7 @@ def state(each: ParameterEstimate) -> str:
         return "not identified"
     if each.covered <= WIDEST:
         return (
-            "not shown to differ from an end of its range"
+            "not identified: its interval reaches an end of its range"
             if each.leaves
             else "not identified: another optimum of the search fits as well"
         )

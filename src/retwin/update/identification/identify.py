@@ -191,7 +191,7 @@ def identify(
     horizon : float, optional
         Time in s over which the twin is simulated from starts that are estimated, for a search and
         a twin with states; infinite for whole records. By default it is chosen where effects of the
-        start last until the end of the record, as in integrating and unstable plants.
+        start last until the end of the record, as in slow, integrating and unstable plants.
     progress : callable, optional
         Called with the share of the work that is done.
 
