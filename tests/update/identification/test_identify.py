@@ -11,7 +11,9 @@ from toys import AFFINE, LAG, LINE, PRODUCT, commands, lag, line, measured, para
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import armpi_parametric
+from retwin.evaluation.identification.validation import validate_identification
 from retwin.testing import TWIN_CHECKS, TwinSubject
+from retwin.twins import State, StateTwin
 from retwin.update.identification import Evolution, LeastSquares, identify, profile
 from retwin.update.identification.search import Loss
 
@@ -293,3 +295,40 @@ def test_delay_and_joint_offsets_of_the_emulated_robot(case: rt.Case) -> None:
     for joint, offset in enumerate(hidden["offset"].mean(axis=(0, 1)), 1):
         name = f"offset.motor_{joint}"
         assert abs(updated.values[name] - offset) < 2 * updated.errors[name]
+
+
+TRUE = {"gain": 3.0, "loss": 0.5}
+"""Parameters of the equations of a lag, which its commands move to levels from 0 to 6."""
+
+
+def lagging() -> rt.ParametricTwin:
+    return StateTwin(
+        [State("x", start=0.0)],
+        lambda x, u: x.x,
+        rt.Channels(("u",), ("1",)),
+        rt.Channels(("y",), ("m",)),
+        10.0,
+        derivative=lambda x, u, p: (p.gain * u.u - p.loss * x.x,),
+        parameters=[rt.Parameter("gain", "1", 0.1, 10.0), rt.Parameter("loss", "1", 0.05, 5.0)],
+    ).parametric()
+
+
+@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize("kind", ["equations", "function"])
+def test_a_sensor_that_stops_at_a_limit_biases_nothing(kind: str, count: int) -> None:
+    twin, true = (lagging(), TRUE) if kind == "equations" else (LAG, {"gain": 1.7, "share": 0.8})
+    inputs = len(twin.inputs)
+    steps = np.random.default_rng(3).uniform(0.0, 1.0, (count, 25, inputs)).repeat(20, axis=1)
+    made = twin.with_values(true).simulate(steps, seed=0)
+    clean = made.observed.astype(float)
+    noise = 0.02 * clean.std() * np.random.default_rng(4).normal(size=clean.shape)
+    limit = float(np.quantile(clean, 0.6))
+    observed = made.replace(observed=np.minimum(clean + noise, limit))
+    with pytest.warns(UserWarning, match=f"y never above {limit:.6g}: taken for limits"):
+        updated = identify(twin, observed, LeastSquares(2), seed=0)
+    for name, value in true.items():
+        assert updated.values[name] == pytest.approx(value, rel=0.02)
+    # The twin itself has no limit.
+    assert updated.twin.simulate(steps, seed=0).observed.max() > 1.1 * limit
+    checked = validate_identification(updated, twin, observed)
+    assert checked.outputs[0].identification.after < 0.03 * clean.std()

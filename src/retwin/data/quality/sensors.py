@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from retwin.data.measured import stand_in
 from retwin.data.quality.finding import Finding
-from retwin.data.quality.readings import MOVED, WINDOW, Readings
+from retwin.data.quality.readings import MOVED, WINDOW, Readings, readings_of
+from retwin.data.trajectories import Trajectories
 
 FLOOR = 1e-5
 """Noise over the range of an output from which it is that of a sensor, and no rounding."""
@@ -22,6 +23,8 @@ RELATED = 0.5
 
 CONSTANT = "never changes"
 """What is wrong with an output that has one value in all records."""
+LIMIT = "limit"
+"""What is wrong with an output that stops at a value that its sensor does not exceed."""
 
 
 def find_constant(every: Sequence[Readings]) -> Iterator[Finding]:
@@ -41,14 +44,35 @@ def find_constant(every: Sequence[Readings]) -> Iterator[Finding]:
 
 def find_stretches(every: Sequence[Readings]) -> Iterator[Finding]:
     """Values that last while everything that drives the output moves: frozen, or a limit."""
+    for each, level in _find_levels(every):
+        start, end, count = each.span_of(level)
+        yield each.finding(*_name(each, level, start, end, count), start, end)
+
+
+def limits_of(records: Trajectories) -> NDArray:
+    """The lowest and highest value (2, d_y) that sensors give, infinite where none is seen.
+
+    At it an output stays exactly and again and again, or for long, and never goes beyond it in any
+    record.
+    """
+    limits = np.repeat([[-np.inf], [np.inf]], len(records.outputs), axis=1)
+    for every in readings_of(records):
+        own = limits[:, records.outputs.names.index(every[0].channel)]
+        ends = min(each.values.min() for each in every), max(each.values.max() for each in every)
+        for each, level in _find_levels(every):
+            if _name(each, level, *each.span_of(level))[0] == LIMIT and level in ends:
+                own[ends.index(level)] = level
+    return limits
+
+
+def _find_levels(every: Sequence[Readings]) -> Iterator[tuple[Readings, float]]:
+    """Levels at which an output stays longer than any should, with their records."""
     longest = np.array([each.still.max(initial=0) for each in every])
     noisy = _noisy(every)
     for place, each in enumerate(every):
         others = np.delete(longest, place)
         usual = float(np.quantile(others, 0.25)) if len(others) else 0.0
-        for level in _unusual(each, usual, noisy=noisy):
-            start, end, count = each.span_of(level)
-            yield each.finding(*_name(each, level, start, end, count), start, end)
+        yield from ((each, level) for level in _unusual(each, usual, noisy=noisy))
 
 
 def _name(each: Readings, level: float, start: int, end: int, count: int) -> tuple[str, str]:
@@ -57,7 +81,7 @@ def _name(each: Readings, level: float, start: int, end: int, count: int) -> tup
     if end - start == each.size and count == 1:
         return "frozen", f"is {level:.6g} all the time, {why}"
     if level in (each.values.min(), each.values.max()) and (count > 1 or end < each.size):
-        return "limit", f"stays at exactly {level:.6g} and never beyond, {why}"
+        return LIMIT, f"stays at exactly {level:.6g} and never beyond, {why}"
     return "frozen", f"stays at exactly {level:.6g}, {why} or its noise is seen elsewhere"
 
 

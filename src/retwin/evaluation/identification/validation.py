@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import require
+from retwin.data.quality.sensors import limits_of
 from retwin.data.trajectories import Trajectories
 from retwin.evaluation.identification.parameters import (
     Basis,
@@ -20,6 +21,7 @@ from retwin.evaluation.identification.residual_tests import ResidualTest, residu
 from retwin.scores.intervals import MIN_GROUPS, jackknife_interval
 from retwin.scores.residuals import decorrelated_after
 from retwin.twins.twin import checked_stride
+from retwin.twins.wrappers.limited import limited
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.windows import simulated as simulated_outputs
 from retwin.update.forecasts import BEGIN
@@ -110,7 +112,8 @@ class Identification:
         What was held out: "trajectories", the last part of each in "time", or "none".
     simulated : dict of str to tuple
         By part, "identification" and "validation": measured trajectories, and outputs (n, T, d_y)
-        of the twin before and after. Over a horizon, the mask contains the samples predicted.
+        of the twin before and after, within the limits of sensors that the records show. Over a
+        horizon, the mask contains the samples predicted.
     found : Updated or Posterior
         The result of `rt.identify`.
 
@@ -225,10 +228,12 @@ def validate_identification(
     if held_out is not None:
         parts["validation"] = held_out
     simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]] = {}
+    limits = limits_of(used)
+    twins = limited(before, limits), limited(mean, limits)
     for part, measured in parts.items():
         checked_stride(before, measured, None, part)
         own = isinstance(found, Updated) and bool(found.own_starts)
-        simulated[part] = _simulate((before, mean), measured, used, horizon, seed=seed, own=own)
+        simulated[part] = _simulate(twins, measured, used, horizon, seed=seed, own=own)
     last = simulated["validation" if held_out is not None else "identification"]
     return Identification(
         twin=mean,

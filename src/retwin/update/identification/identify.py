@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,9 +17,11 @@ from scipy import stats
 from retwin.checks import given, require
 from retwin.data.measured import measured_only, unmeasured
 from retwin.data.quality.copies import distinct_records
+from retwin.data.quality.sensors import limits_of
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
+from retwin.twins.wrappers.limited import limited
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.windows import state_based
 from retwin.update.identification.bayes import infer_posterior
@@ -173,7 +175,9 @@ def identify(
         Declares the free parameters, their bounds, and the first start. The prior of Eq. 3 is
         uniform within the bounds.
     observed : Trajectories
-        Healthy calibration trajectories with commands; masked samples are not used.
+        Healthy calibration trajectories with commands; masked samples are not used. Where an
+        output stays at exactly its lowest or highest value, that is taken for a limit of its
+        sensor, which a simulated value may exceed.
     method : LeastSquares, Evolution, MCMC or NPE
         Local searches from several starts, a global search, Markov chains for fast twins such as
         surrogates, or a network that needs few simulations. The loss of the searches is robust by
@@ -211,8 +215,9 @@ def identify(
     Warns
     -----
     UserWarning
-        Parameters are not identified, or their best value lies on a bound (Eq. 2); chains are
-        short, or the data lie outside the prior predictive distribution (Eq. 3).
+        Readings stop at a limit. Parameters are not identified, or their best value lies on a
+        bound (Eq. 2); chains are short, or the data lie outside the prior predictive distribution
+        (Eq. 3).
 
     """
     require(
@@ -227,19 +232,48 @@ def identify(
         missing = unmeasured(observed)
         observed = measured_only(observed) if missing else observed
     found: Updated | Posterior
+    limits, read = np.array([]), twin
+    if isinstance(twin, ParametricTwin) and isinstance(observed, Trajectories):
+        limits = limits_of(observed)
+        read = limited(twin, limits)
     begin = partial(misfit_of, seed=seed, rate=rate, processes=processes)
     if isinstance(method, MCMC | NPE):
-        with begin(twin, observed) as misfit:
+        with begin(read, observed) as misfit:
             found = infer_posterior(misfit, method, progress)
     else:
         several = isinstance(observed, Trajectories) and len(observed) > 1
         how = (partial(begin, own=several), missing, progress)
-        found = _search(twin, observed, method, horizon, how)
+        found = _search(read, observed, method, horizon, how)
         copies = int(found.figures["copies"])
         again = f"{copies} of {len(observed)} trajectories are copies and count once"
         for note in filter(None, [found.identifiability.warning, missing, again * bool(copies)]):
             warnings.warn(note, stacklevel=2)
+    if read is not twin:
+        found = _without_limits(found, twin)
+        warnings.warn(_describe_limits(observed.outputs.names, limits), stacklevel=2)
     return replace(found, seconds=time.perf_counter() - began)
+
+
+def _without_limits(found: Updated | Posterior, twin: ParametricTwin) -> Updated | Posterior:
+    """What was found for readings of a twin, for the twin itself."""
+    if isinstance(found, Updated):
+        return replace(found, twin=replace(found.twin, twin=twin.twin))
+    own = replace(found.twin.twin, twin=twin.twin)
+    return replace(found, twin=replace(found.twin, twin=own))
+
+
+def _describe_limits(outputs: Sequence[str], limits: NDArray) -> str:
+    """How limits (2, d_y) of the sensors were taken."""
+    ends = [
+        f"{name} never {side} {end:.6g}"
+        for name, own in zip(outputs, limits.T, strict=True)
+        for side, end in zip(("below", "above"), own, strict=True)
+        if np.isfinite(end)
+    ]
+    return (
+        f"{', '.join(ends)}: taken for limits of the sensors, so that a simulated value beyond a "
+        "limit agrees with a reading at it"
+    )
 
 
 def _search(

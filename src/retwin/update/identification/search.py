@@ -166,7 +166,9 @@ class Search:
         if robust:
             # All starts share one scale, so that their optima are comparable.
             best = min(found, key=lambda each: each.cost)
-            middle = float(np.median(np.abs(best.fun[self.misfit.seen.ravel()])))
+            sizes = np.abs(best.fun[self.misfit.seen.ravel()])
+            # Exactly 0 is what agrees with a reading at a limit of its sensor.
+            middle = float(np.median(sizes[sizes > 0])) if sizes.any() else 0.0
             self.loss = self.method.loss
             self.scale = max(1.4826 * middle, 1e-9 * self.misfit.spread)
             require(

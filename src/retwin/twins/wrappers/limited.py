@@ -1,0 +1,71 @@
+"""`limited`: a twin whose outputs are read by sensors that stop at limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.trajectories import Trajectories
+from retwin.twins.equations.state_twin import StateTwin
+from retwin.twins.wrappers.parametric import ParametricTwin, TakesParameters
+from retwin.twins.wrappers.wrapper import TwinWrapper
+
+
+def limited(twin: ParametricTwin, limits: NDArray) -> ParametricTwin:
+    """The same twin, whose outputs count as the limit where they are beyond it.
+
+    Parameters
+    ----------
+    twin : ParametricTwin
+        The twin.
+    limits : NDArray
+        (2, d_y), the lowest and the highest value of each output; infinite for none.
+
+    """
+    inner: Any = twin.twin
+    if not np.isfinite(limits).any():
+        return twin
+    if isinstance(inner, StateTwin):  # whose outputs keep their derivatives
+        return replace(twin, twin=replace(inner, output=_limited_output(inner.output, limits)))
+    return replace(twin, twin=_LimitedTwin(inner, limits))
+
+
+def _limited_output(output: Callable[..., Any], limits: NDArray) -> Callable[..., Any]:
+    """The outputs of state equations between limits (2, d_y)."""
+    import torch
+
+    from retwin.twins.compiled.model import with_parameters
+
+    every = with_parameters(output)
+
+    def read(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+        made = every(x, u, p)
+        values = made if isinstance(made, tuple | list) else (made,)
+        return tuple(
+            torch.clamp(value, *ends) if np.isfinite(ends).any() else value
+            for value, ends in zip(values, limits.T.tolist(), strict=True)
+        )
+
+    return read
+
+
+@dataclass(frozen=True, eq=False)
+class _LimitedTwin(TwinWrapper):
+    """Any other twin with outputs between limits (2, d_y)."""
+
+    twin: TakesParameters
+    limits_of_outputs: NDArray
+
+    @property
+    def deterministic(self) -> bool:
+        """Whether the wrapped twin declares that its outputs depend on no seed."""
+        return getattr(self.twin, "deterministic", False)
+
+    def simulate(self, commands: NDArray, **options: Any) -> Trajectories:
+        """See `TakesParameters.simulate`."""
+        made = self.twin.simulate(commands, **options)
+        return made.replace(observed=np.clip(made.observed, *self.limits_of_outputs))
