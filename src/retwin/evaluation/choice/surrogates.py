@@ -26,9 +26,9 @@ from retwin.update.dynamics import state_names
 from retwin.update.state_surrogate import StateSurrogate, fit_state_surrogate
 from retwin.update.surrogate import Surrogate, fit_surrogate
 
-SLOW = 0.03
-"""Duration in s of a simulation of one record from which on a surrogate pays: ten thousand of them
-take as long as its training, some minutes."""
+SLOW = 1.0
+"""Duration in s of a simulation of one record from which on a surrogate pays. It needs hundreds of
+simulations and minutes of training, and candidates need some ten of each record."""
 SMALL = 0.5
 """Largest error of a surrogate on the commands of the records, over the discrepancy of the twin
 there, both root mean squares: of their sum it is then a tenth."""
