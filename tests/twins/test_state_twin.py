@@ -347,13 +347,36 @@ def test_a_simulation_that_diverges_fails_alone() -> None:
 
 
 @pytest.mark.parametrize(
+    ("by_numpy", "by_torch"),
+    [
+        (lambda x: np.sqrt(1 + x) + np.float64(2) * x, lambda x: torch.sqrt(1 + x) + 2 * x),
+        (lambda x: np.where(x > 0.1, -x, np.abs(x)), lambda x: torch.where(x > 0.1, -x, x.abs())),
+        (lambda x: np.log10(x + 2) + np.log2(x + 2), lambda x: torch.log(x + 2) * 1.8769897227),
+        (lambda x: np.maximum(x, 0.2) ** 2 - np.pi, lambda x: x.clamp(min=0.2) ** 2 - np.pi),
+        (lambda x: np.arctan2(x, 2) + np.power(x, 2), lambda x: torch.atan(x / 2) + x * x),
+        (lambda x: np.clip(x, -1, 0.2) * np.tanh(x), lambda x: x.clamp(-1, 0.2) * torch.tanh(x)),
+    ],
+)
+def test_equations_may_be_written_with_numpy(by_numpy, by_torch) -> None:
+    made = [
+        replace(stiff_twin(1.0), derivative=lambda x, u, own=own: own(x.level) + u.pump)
+        .simulate(noise(2, 20), seed=0)
+        .observed
+        for own in (by_numpy, by_torch)
+    ]
+    np.testing.assert_allclose(made[0], made[1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
     ("function", "message"),
     [
         (lambda x, u, p: x.level if x.level > 0 else u.pump, "number taken out of a tensor"),
         (lambda x, u, p: float(x.level), "number taken out of a tensor"),
         (lambda x, u, p: torch.special.bessel_j0(x.level), "bessel_j0"),
         (lambda x, u, p: x.level.float(), "torch.float32"),
-        (lambda x, u, p: np.sin(x.level), "number taken out of a tensor"),
+        (lambda x, u, p: np.array([x.level]), "number taken out of a tensor"),
+        (lambda x, u, p: np.add.accumulate(x.level), "numpy.add with accumulate"),
+        (lambda x, u, p: np.gcd(x.level, 2), "torch.gcd"),
         (lambda x, u, p: (x.level, u.pump), "1 scalars.*got 2"),
         (lambda x, u, p: None, "1 scalars"),
         (lambda x, u, p: x.level.add_(u.pump), "in place"),

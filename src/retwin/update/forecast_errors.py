@@ -57,9 +57,9 @@ class ForecastErrors:
     low, high : NDArray
         (d_u + d_y,), least and greatest value of the commands, and then of the outputs, in the
         calibration.
-    beyond : float
-        How far a value may leave that range, in widths of it: as far as the parts that were left
-        out left the range of the others while the bands held.
+    beyond : NDArray
+        (d_u + d_y,), how far a value may leave that range, in widths of it: as far as the parts
+        that were left out left the range of the others while the bands held.
     longest : float
         Time in s of the longest record of the calibration; infinite where it is not known.
     drifts : bool
@@ -77,7 +77,7 @@ class ForecastErrors:
     memory: float
     low: NDArray
     high: NDArray
-    beyond: float
+    beyond: NDArray
     longest: float = np.inf
     drifts: bool = False
     started: NDArray | None = None
@@ -109,7 +109,7 @@ class ForecastErrors:
 
         """
         steps = np.arange(values.shape[1])
-        far = range_excess(values, self.low, self.high) > self.beyond
+        far = (channel_excess(values, self.low, self.high) > self.beyond).any(axis=2)
         last = np.maximum.accumulate(np.where(far, steps, -np.inf), axis=1)
         return np.asarray(steps - last <= self.memory * rate)
 
@@ -143,7 +143,7 @@ class ForecastErrors:
             got=[each.shape for each in arrays.values()],
             remedy="save the model again",
         )
-        # Models that were saved before have none of these.
+        # Models that were saved before have none of these, and one number `beyond`.
         longest, started = values.get("longest"), values.get("started")
         return cls(
             leads=leads,
@@ -151,7 +151,7 @@ class ForecastErrors:
             drifts=bool(values.get("drifts")),
             started=None if started is None else np.array(started, dtype=float),
             memory=float(values["memory"]),
-            beyond=float(values["beyond"]),
+            beyond=np.broadcast_to(np.asarray(values["beyond"], dtype=float), low.shape),
             **arrays,
         )
 
@@ -204,12 +204,20 @@ def value_range(values: NDArray) -> tuple[NDArray, NDArray]:
 def range_excess(values: NDArray, low: NDArray, high: NDArray) -> NDArray:
     """How far each sample (n, T) of values (n, T, d) leaves a range (d,), in widths of that.
 
+    See `channel_excess`; the furthest channel counts.
+    """
+    return channel_excess(values, low, high).max(axis=2, initial=0.0)
+
+
+def channel_excess(values: NDArray, low: NDArray, high: NDArray) -> NDArray:
+    """How far each of values (n, T, d) leaves its range (d,), in widths of that; 0 inside.
+
     NaN counts as inside; the width of a constant is its size, or 1 if that is 0.
     """
     size = np.where(high != 0, np.abs(high), 1.0)
     width = np.where(high > low, high - low, size)
     distance = np.nan_to_num(np.maximum(values - high, low - values) / width)
-    return distance.max(axis=2, initial=0.0)
+    return np.asarray(np.maximum(distance, 0.0))
 
 
 def predictive_deviation(errors: NDArray, independent: float) -> float:

@@ -201,8 +201,9 @@ class LeftOut:
         The r records of which something was left out.
     held : NDArray
         (r, T) bool, the samples that were left out.
-    excess : float
-        How far their values leave the range of those that the model was fitted to, in widths.
+    excess : NDArray
+        (d_u + d_y,), how far their values leave the range of those that the model was fitted to,
+        in widths.
     edge : bool
         Whether they are the largest commands and outputs of all.
     started : NDArray or None
@@ -215,7 +216,7 @@ class LeftOut:
     free: NDArray
     record: Trajectories
     held: NDArray
-    excess: float
+    excess: NDArray
     edge: bool
     started: NDArray | None = None
 
@@ -232,9 +233,9 @@ def calibrate_forecasts(
 ) -> ForecastErrors:
     """The errors of predictions, from parts of records that the models were not fitted to.
 
-    Deviations are those of parts in time. Where the bands of free simulation hold the largest
-    commands and outputs too, they are given as far beyond the range of the calibration as these
-    are beyond that of the others.
+    Deviations are those of parts in time. Where the bands of free simulation hold a part whose
+    commands and outputs are beyond the range of the others, such as the largest ones, they are
+    given as far beyond the range of the calibration.
 
     Parameters
     ----------
@@ -252,10 +253,8 @@ def calibrate_forecasts(
     rows = [[_calibrate(pairs, channel) for channel in channels] for pairs in errors]
     persistence, deviation, independent, correlation = np.moveaxis(np.array(rows), 2, 0)
     memory = float(FORGOTTEN * correlation[-1].max() / records.rate)
-    beyond = max([BEYOND, *(each.excess for each in inner)])
-    for each in found:
-        if each.edge and _hold(each, deviation[-1]):
-            beyond = max(beyond, each.excess)
+    held = [each.excess for each in found if _hold(each, deviation[-1])]
+    beyond = np.maximum(BEYOND, np.max([0.0 * found[0].excess, *held], axis=0))
     times = np.append(np.array(leads) / records.rate, np.inf)
     known, free = [values_of(records)], [each for each, _ in errors[-1]]
     # Errors are calibrated where outputs were predicted, and not only where they were measured.

@@ -17,6 +17,7 @@ from retwin.checks import require
 from retwin.data.measured import check_magnitude
 from retwin.data.quality.check import Checked
 from retwin.data.quality.copies import distinct_records
+from retwin.data.quality.sensors import limits_of
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.choice.candidates import Candidates, Model
 from retwin.evaluation.choice.comparison import Comparison
@@ -34,6 +35,7 @@ from retwin.evaluation.choice.trials import Trials, shorter, unstable
 from retwin.progress import Progress
 from retwin.scores.distributions import crps_normal
 from retwin.twins.twin import Twin, check_channels
+from retwin.twins.wrappers.limited import describe_limits, with_limits
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.agreement import check_with_twin
 from retwin.update.blackbox import BLACK_BOXES, fit_black_box
@@ -123,6 +125,8 @@ def fit(
     check_channels(twin, records, "records")
     others = other_machines(settings.prior, settings.correction or DelayOffset(), twin)
     checked = check_with_twin(original or twin, given_records)
+    limits = limits_of(records)
+    twin = with_limits(twin, limits)
     shown = None if settings.compared else progress
     whole = Candidates(twin, records, settings, seed, case, original, shown)
     names = _names(whole, settings)
@@ -148,6 +152,9 @@ def fit(
         for name in trials.names
     )
     remarks = remarks_of(records, comparison, scores, chosen, preferred, horizon)
+    if state_names(twin):
+        text = describe_limits(twin.outputs.names, limits)
+        remarks = (*remarks, *([f"{text}."] if text else []))
     if settings.identified and "none" not in names and "parameters" in names:
         remarks = (*remarks, IDENTIFIED)
     if horizon != settings.horizon:

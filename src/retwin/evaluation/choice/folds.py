@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.update.dynamics.estimation import correlation_time
-from retwin.update.forecast_errors import range_excess, value_range
+from retwin.update.forecast_errors import channel_excess, value_range
 from retwin.update.forecasts import values_of
 
 RECORDS = 4
@@ -46,12 +46,12 @@ class Fold:
         mask = records.mask & ~self.held[..., None]
         return records.replace(mask=mask)[kept]
 
-    def excess(self, records: Trajectories) -> float:
-        """How far its values leave the range of the others, in widths of that."""
+    def excess(self, records: Trajectories) -> NDArray:
+        """How far its values (d_u + d_y,) leave the range of the others, in widths of that."""
         values = values_of(records)
         others = np.where(self.held[..., None], np.nan, values)
         held = np.where(self.held[..., None], values, np.nan)
-        return float(range_excess(held, *value_range(others)).max())
+        return np.asarray(channel_excess(held, *value_range(others)).max(axis=(0, 1)))
 
 
 def folds_of(records: Trajectories, *, blocks: int = 4) -> list[Fold]:

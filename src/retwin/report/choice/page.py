@@ -20,7 +20,7 @@ from retwin.report.figures.figure import Band, Figure, Key, Line, Mark, record_p
 from retwin.report.identification.figures import OUTPUTS, SAMPLES
 from retwin.report.labels import significant
 from retwin.report.records import TITLE, records_part
-from retwin.update.forecast_errors import USUAL
+from retwin.update.forecast_errors import BEYOND, USUAL
 
 MEASURED, PREDICTED = "muted", "c0"
 
@@ -59,9 +59,19 @@ def fit_page(found: Fitted, folder: str, *, title: str) -> str:
         sentences=model_sentences(found),
         bands=_bands(found),
         promised=forecast is not None and forecast.promised,
-        beyond=forecast.beyond if forecast else 0.0,
+        beyond=_beyond(found),
         figures=figures,
     )
+
+
+def _beyond(found: Fitted) -> dict[str, float]:
+    """By channel, how far it may leave its range in widths of that, where that is far."""
+    forecast, records = found.twin.forecast, found.records
+    if forecast is None:
+        return {}
+    names = (*records.inputs.names, *records.outputs.names)
+    shares = dict(zip(names, forecast.beyond.tolist(), strict=True))
+    return {name: share for name, share in shares.items() if share > BEYOND}
 
 
 def _bands(found: Fitted) -> Table:

@@ -20,6 +20,8 @@ from retwin.twins.compiled.program import COMPARISONS, OPERATIONS, Node, Program
 
 ELEMENTWISE: dict[str, Callable[..., Node]] = {
     **{op: (lambda *args, op=op: args[0].program.node(op, *args)) for op in OPERATIONS},
+    "log10": lambda a: a.program.node("log", a) * (1 / np.log(10.0)),
+    "log2": lambda a: a.program.node("log", a) * (1 / np.log(2.0)),
     "square": lambda a: a * a,
     "reciprocal": lambda a: a.program.node("div", 1.0, a),
     "rsqrt": lambda a: a.program.node("div", 1.0, a.program.node("sqrt", a)),
@@ -65,6 +67,10 @@ SHAPES: dict[str, Callable[..., Any]] = {
 """Operators that rearrange, add or multiply elements, on arrays of nodes."""
 
 
+NUMPY = {"absolute": "abs", "fabs": "abs", "power": "pow", "float_power": "pow"}
+"""Names in torch of functions of numpy that have another one there."""
+
+
 def traced(
     function: Callable[..., Any], program: Program, groups: Sequence[Any], count: int, role: str
 ) -> list[Node]:
@@ -100,11 +106,14 @@ def traced(
         try:
             returned = function(*arguments)
         except _RefusedError as error:
+            known = sorted(e for e in ELEMENTWISE if e not in COMPARISONS and "bitwise" not in e)
             raise InputError(
                 role,
-                expected="operations of torch on scalars, without branches that depend on them",
+                expected="operations of torch or numpy on scalars, without branches that depend "
+                "on them",
                 got=str(error),
-                remedy="use torch.where, torch.sqrt, … in place of if, math and numpy",
+                remedy="use torch.where, torch.sqrt, … in place of if and math; there are "
+                f"{', '.join(known)}",
             ) from None
     if isinstance(returned, Tensor):
         returned = returned.unbind() if returned.ndim else [returned]
@@ -138,6 +147,18 @@ class _Traced(Tensor):
 
     def __array__(self, dtype: Any = None) -> NDArray:
         raise _RefusedError(_describe("item"))
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *given: Any, **options: Any) -> Any:
+        """A function of numpy, by that of torch."""
+        if method != "__call__" or options:
+            raise _RefusedError(f"numpy.{ufunc.__name__} with {method or 'options'}")
+        return _by_torch(ufunc.__name__, given)
+
+    def __array_function__(self, function: Any, types: Any, given: Any, options: Any) -> Any:
+        """Such as `numpy.where`, by that of torch."""
+        if options:
+            raise _RefusedError(f"numpy.{function.__name__} with {', '.join(options)}")
+        return _by_torch(function.__name__, given)
 
     @classmethod
     def __torch_dispatch__(  # type: ignore[override]  # declared by torch as the default's own
@@ -175,6 +196,17 @@ class _Traced(Tensor):
         return _Traced(_array(made), torch.bool if truth else torch.float64)
 
 
+def _by_torch(name: str, given: Sequence[Any]) -> Any:
+    """What torch has for a function of numpy, of scalars and tensors."""
+    function = getattr(torch, NUMPY.get(name, name), None)
+    if function is None:
+        raise _RefusedError(f"numpy.{name}")
+    own = [
+        e if isinstance(e, Tensor) else torch.tensor(float(e), dtype=torch.float64) for e in given
+    ]
+    return function(*own)
+
+
 def _array(value: Any) -> NDArray:
     """An array of objects; a lone node has no axes."""
     if isinstance(value, np.ndarray):
@@ -209,7 +241,7 @@ def _flat(args: Any) -> list[Any]:
 
 def _describe(name: str) -> str:
     if name in ("_local_scalar_dense", "detach", "is_nonzero", "item"):
-        return "a number taken out of a tensor, by if, float, math or numpy"
+        return "a number taken out of a tensor, by if, float, math or numpy.array"
     return f"torch.{name.removesuffix('_')}{' in place' if name.endswith('_') else ''}"
 
 

@@ -1,10 +1,10 @@
-"""`limited`: a twin whose outputs are read by sensors that stop at limits."""
+"""A twin whose outputs are read by sensors that stop at limits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from retwin.data.trajectories import Trajectories
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.wrappers.parametric import ParametricTwin, TakesParameters
 from retwin.twins.wrappers.wrapper import TwinWrapper
+
+TwinType = TypeVar("TwinType")
 
 
 def limited(twin: ParametricTwin, limits: NDArray) -> ParametricTwin:
@@ -26,12 +28,40 @@ def limited(twin: ParametricTwin, limits: NDArray) -> ParametricTwin:
         (2, d_y), the lowest and the highest value of each output; infinite for none.
 
     """
-    inner: Any = twin.twin
+    if isinstance(twin.twin, StateTwin) or not np.isfinite(limits).any():
+        return with_limits(twin, limits)
+    return replace(twin, twin=_LimitedTwin(twin.twin, limits))
+
+
+def with_limits(twin: TwinType, limits: NDArray) -> TwinType:
+    """State equations, alone or with their free parameters, whose outputs have limits (2, d_y).
+
+    Derivatives are exact, and they can be saved. Any other twin is returned as it is.
+    """
+    made: Any = twin
     if not np.isfinite(limits).any():
         return twin
-    if isinstance(inner, StateTwin):  # whose outputs keep their derivatives
-        return replace(twin, twin=replace(inner, output=_limited_output(inner.output, limits)))
-    return replace(twin, twin=_LimitedTwin(inner, limits))
+    if isinstance(twin, StateTwin):
+        made = replace(twin, output=_limited_output(twin.output, limits))
+    elif isinstance(twin, ParametricTwin):
+        made = replace(twin, twin=with_limits(twin.twin, limits))
+    return made
+
+
+def describe_limits(outputs: Sequence[str], limits: NDArray) -> str:
+    """How limits (2, d_y) of the outputs' sensors were taken; "" if there are none."""
+    ends = [
+        f"{name} never {side} {end:.6g}"
+        for name, own in zip(outputs, limits.T, strict=True)
+        for side, end in zip(("below", "above"), own, strict=True)
+        if np.isfinite(end)
+    ]
+    if not ends:
+        return ""
+    return (
+        f"{', '.join(ends)}: taken for limits of the sensors, so that a simulated value beyond a "
+        "limit agrees with a reading at it"
+    )
 
 
 def _limited_output(output: Callable[..., Any], limits: NDArray) -> Callable[..., Any]:

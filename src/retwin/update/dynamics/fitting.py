@@ -16,10 +16,12 @@ from retwin.checks import require
 from retwin.data.measured import unmeasured
 from retwin.data.quality.check import doubtful
 from retwin.data.quality.copies import distinct_records
+from retwin.data.quality.sensors import limits_of
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
+from retwin.twins.wrappers.limited import describe_limits, with_limits
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.between_samples import chosen
 from retwin.update.dynamics.discrepancy.domain import Domain
@@ -124,7 +126,9 @@ def fit_dynamics(
         The equations, with their parameters or with those alone that are to be free; best after
         `identify`, since the search begins there.
     observed : Trajectories
-        Healthy calibration trajectories with commands; masked samples are not used.
+        Healthy calibration trajectories with commands; masked samples are not used. Where an
+        output stays at exactly its lowest or highest value, that is the limit of its sensor, and
+        one of the twin's output.
     settings : Dynamics
         The form of the discrepancy.
     progress : callable, optional
@@ -153,6 +157,8 @@ def fit_dynamics(
     began = time.perf_counter()
     base, free, values = state_twin_of(twin)
     checked_stride(base, observed, None, "observed")
+    limits = limits_of(observed)
+    base = with_limits(base, limits)
     once = distinct_records(np.where(observed.mask, observed.observed, np.nan))
     copies = len(observed) - len(once)
     again = f"{copies} of {len(observed)} trajectories are copies and count once" * bool(copies)
@@ -176,7 +182,8 @@ def fit_dynamics(
     if alone.absorbed is not None:
         unknown |= (alone.absorbed(fitted.point.shared)[1] != 0).any(axis=0)
     own = _notes(estimation, found.point, unknown)
-    notes = "; ".join(filter(None, [own, unmeasured(observed), doubtful(observed), again]))
+    known = unmeasured(observed), doubtful(observed), describe_limits(base.outputs.names, limits)
+    notes = "; ".join(filter(None, [own, *known, again]))
     if notes:
         warnings.warn(notes, stacklevel=2)
     k, count = unknowns.count, len(found.point.shared)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,7 +21,7 @@ from retwin.data.quality.sensors import limits_of
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.wrappers.limited import limited
+from retwin.twins.wrappers.limited import describe_limits, limited
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.windows import state_based
 from retwin.update.identification.bayes import infer_posterior
@@ -250,7 +250,7 @@ def identify(
             warnings.warn(note, stacklevel=2)
     if read is not twin:
         found = _without_limits(found, twin)
-        warnings.warn(_describe_limits(observed.outputs.names, limits), stacklevel=2)
+        warnings.warn(describe_limits(observed.outputs.names, limits), stacklevel=2)
     return replace(found, seconds=time.perf_counter() - began)
 
 
@@ -260,20 +260,6 @@ def _without_limits(found: Updated | Posterior, twin: ParametricTwin) -> Updated
         return replace(found, twin=replace(found.twin, twin=twin.twin))
     own = replace(found.twin.twin, twin=twin.twin)
     return replace(found, twin=replace(found.twin, twin=own))
-
-
-def _describe_limits(outputs: Sequence[str], limits: NDArray) -> str:
-    """How limits (2, d_y) of the sensors were taken."""
-    ends = [
-        f"{name} never {side} {end:.6g}"
-        for name, own in zip(outputs, limits.T, strict=True)
-        for side, end in zip(("below", "above"), own, strict=True)
-        if np.isfinite(end)
-    ]
-    return (
-        f"{', '.join(ends)}: taken for limits of the sensors, so that a simulated value beyond a "
-        "limit agrees with a reading at it"
-    )
 
 
 def _search(
