@@ -18,8 +18,6 @@ from retwin.monitor.detect.events import CHANGED, FOLLOWS, Course, Rules
 from retwin.monitor.detect.noise import DECAYS, Noise, features, own_scale
 from retwin.monitor.detect.predictors import (
     Predictor,
-    by_machine,
-    by_output,
     by_stream,
     finite_state,
     implausible,
@@ -201,8 +199,8 @@ class Monitor:
 
         """
         check_channels(self.twin, record, "record")
-        measured = np.where(record.mask, record.observed, np.nan)
-        return self.step(self.start(len(record)), record.commands, measured, record.ids)[1]
+        start = self.start(len(record))
+        return self.step(start, record.commands, record.measured, record.ids)[1]
 
     @property
     def rules(self) -> Rules:
@@ -231,8 +229,9 @@ class Monitor:
         sums = np.where(calm[:, None], sums, state.scale)
         own = np.where(calm[:, None], own, own[:, :1])
         error, width = error / own, width / own
-        low, high = self.scores.score(by_output(error, count), by_output(width, count))
-        low, high = (by_stream(by_machine(each, count)) for each in (low, high))
+        by_machine = (each.reshape(count, len(self.slack), -1) for each in (error, width))
+        scored = self.scores.score(*(np.swapaxes(each, 0, 1) for each in by_machine))
+        low, high = (by_stream(np.moveaxis(each, 0, 2)) for each in scored)
         since, rate = state.course.samples - state.course.begun, self.twin.rate
         used = np.stack([each.used(since, samples, rate) for each in self.predictors], axis=1)
         used = np.repeat(used, len(self.twin.outputs), axis=1).reshape(low.shape)
@@ -392,7 +391,7 @@ class Monitor:
             high = np.maximum(high, self.twin.forecast.high[-count:])
         found = {}
         for i, name in enumerate(self.twin.outputs.names):
-            own = np.where(record.mask[..., i], record.observed[..., i], np.nan)
+            own = record.measured[..., i]
             excess = range_excess(own[..., None], low[[i]], high[[i]])
             row, furthest = np.unravel_index(np.argmax(excess), excess.shape)
             if excess[row, furthest] > FAR:
