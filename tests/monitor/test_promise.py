@@ -42,5 +42,11 @@ def test_the_rate_is_checked() -> None:
 
 def test_the_promise_states_class_rate_and_level() -> None:
     text = str(Promise(864000.0, 1.0, Slack(1.25, 0.1), alpha=0.05))
-    for part in ("864000 measured samples", "10 days", "1.25 times as large", "0.1 standard", "0.05"):
+    for part in (
+        "864000 measured samples",
+        "10 days",
+        "1.25 times as large",
+        "0.1 standard",
+        "0.05",
+    ):
         assert part in text

@@ -206,7 +206,7 @@ def _folders(
     for name in [settings.asset] if settings.asset else systems:
         monitor, case = live.monitor(name), systems[name]
         if isinstance(monitor, TrajectoryMonitor):
-            recorded[name] = Recorded(monitor, case)
+            recorded[name] = monitor, case
         else:
             require(
                 settings.files.endswith((".csv", ".parquet")),

@@ -253,8 +253,8 @@ class Live:
                 with self._using(given.asset):
                     if self._machines.get(given.asset) is not machine:
                         continue  # another version watches since
-                    if made.watched is None:
-                        machine.refuse(int(made.samples.times[0]), made.refused)
+                    if isinstance(made, str):
+                        machine.refuse(given.begin, made)
                         return self._counted(machine, "refused")
                     return self._counted(machine, "used", machine.take(made))
 

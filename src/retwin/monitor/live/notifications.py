@@ -24,7 +24,7 @@ from retwin.monitor.models.cause import cause_text
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.store.store import Store
-from retwin.serialisation.files import refusing, write_atomically
+from retwin.serialisation.files import read_json, refusing, write_json
 
 FIRST, LONGEST = 1.0, 300.0
 """Seconds after which a message that failed is sent again at first, and at most."""
@@ -200,8 +200,8 @@ class Notifications:
             self._write()
 
     def _write(self) -> None:
-        with self._lock, write_atomically(self._file) as part:
-            part.write_text(json.dumps(self._sent), encoding="utf-8")
+        with self._lock:
+            write_json(self._file, self._sent)
 
 
 def _read(file: Path) -> dict[str, int]:
@@ -210,8 +210,7 @@ def _read(file: Path) -> dict[str, int]:
         return {}
     expected = "a file that says which entries were sent"
     with refusing(file, expected=expected, remedy="remove it: then only new entries are sent"):
-        sent = json.loads(file.read_bytes())
-        return {str(name): int(sequence) for name, sequence in sent.items()}
+        return {str(name): int(sequence) for name, sequence in read_json(file).items()}
 
 
 REMEDY = (

@@ -189,24 +189,21 @@ class Visible:
             return self.share < SHARE
         return self.share < SHARE or abs(self.size) >= abs(self.value)
 
+    def _with_unit(self, size: float) -> str:
+        return f"{abs(size):.3g}" + (f" {self.unit}" if self.unit not in ("", "1") else "")
+
     @property
     def shown_size(self) -> str:
         """The size from which on it is seen, with its unit and as a share of what it changes."""
-        of = f" {self.unit}" if self.unit not in ("", "1") else ""
-        text = f"{abs(self.size or 0.0):.3g}{of}"
+        text = self._with_unit(self.size or 0.0)
         if self.size is not None and self.value and self.value != 1:
             text += f", {abs(self.size / self.value):.0%} of the {self.compared}"
         return text
 
     def __str__(self) -> str:
         """One line for the terminal."""
-        of = f" {self.unit}" if self.unit not in ("", "1") else ""
+        what = "seen" if self.size is None else f"seen from a size of {self.shown_size}"
         if self.share < SHARE:
-            what = (
-                "not seen"
-                if self.largest is None
-                else f"not seen up to {abs(self.largest):.3g}{of}"
-            )
-        else:
-            what = "seen" if self.size is None else f"seen from a size of {self.shown_size}"
+            up_to = "" if self.largest is None else f" up to {self._with_unit(self.largest)}"
+            what = f"not seen{up_to}"
         return f"{self.fault}: {what} ({self.share:.0%} within {duration(self.within)})"

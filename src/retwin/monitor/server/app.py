@@ -133,21 +133,20 @@ def create_app(
 def _report_errors(app: fastapi.FastAPI) -> None:
     """Turn errors into one line of JSON."""
 
+    @app.exception_handler(InputError)
     def refused(request: fastapi.Request, error: Exception) -> Any:
         return JSON({"error": str(error)}, 400)
 
+    @app.exception_handler(fastapi.exceptions.RequestValidationError)
     def invalid(request: fastapi.Request, error: Any) -> Any:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         return JSON({"error": f"{where}: {first['msg']}"}, 422)
 
+    @app.exception_handler(HTTPException)
     def unknown(request: fastapi.Request, error: Any) -> Any:
         headers = getattr(error, "headers", None)
         return JSON({"error": error.detail}, error.status_code, headers)
-
-    app.add_exception_handler(InputError, refused)
-    app.add_exception_handler(fastapi.exceptions.RequestValidationError, invalid)
-    app.add_exception_handler(HTTPException, unknown)
 
 
 def _add_page(app: fastapi.FastAPI) -> None:

@@ -98,19 +98,11 @@ class Committed:
     entries: list[Entry]
 
 
-@dataclass(frozen=True)
-class Packed:
-    """An update as rows of the tables: the times of its samples, their rows, and the state's."""
-
-    asset: str
-    key: int
-    times: NDArray
-    rows: list[tuple]
-    state: tuple | None
-
-
-def pack(update: Update, known: Mapping[str, tuple[int, int]]) -> Packed:
-    """An update as rows, with the keys and the channels of the store's assets by their names.
+def pack(
+    update: Update, known: Mapping[str, tuple[int, int]]
+) -> tuple[int, NDArray, list[tuple], list[tuple]]:
+    """An update as rows of the tables: the key of its asset, times and rows of its samples, and the
+    row of its state, if it has one. `known` are keys and channels of the store's assets.
 
     Raises
     ------
@@ -138,10 +130,10 @@ def pack(update: Update, known: Mapping[str, tuple[int, int]]) -> Packed:
     data, size = values.tobytes(), channels * WORD.itemsize
     rows = [(key, time, data[i * size : (i + 1) * size]) for i, time in enumerate(stamps.tolist())]
     if update.state is None:
-        return Packed(update.asset, key, stamps, rows, None)
+        return key, stamps, rows, []
     time = update.time if update.time is not None else max(stamps.tolist(), default=None)
     whole(f"time of the state of {update.asset}", time, at_least=EARLIEST, at_most=LATEST)
-    return Packed(update.asset, key, stamps, rows, (key, time, blob))
+    return key, stamps, rows, [(key, time, blob)]
 
 
 def one_asset(known: Mapping[str, T], name: str) -> T:

@@ -34,7 +34,6 @@ from retwin.monitor.store.samples import (
     WORD,
     Asset,
     Committed,
-    Packed,
     Update,
     one_asset,
     pack,
@@ -193,17 +192,16 @@ class Store:
         with self._writing() as connection:
             known = self._known(connection)
             packed = [pack(each, known) for each in updates]
-            names = [each.asset for each in packed]
+            names = [each.asset for each in updates]
             one_per("updates", names, len(set(names)), "asset", remedy="join the samples of each")
-            repeated = {}
-            rows = []
-            for each in packed:
-                new = self._new(connection, each)
+            repeated, inserted, latest = {}, list[tuple](), list[tuple]()
+            for name, (key, times, rows, state) in zip(names, packed, strict=True):
+                new = self._new(connection, key, times)
                 if not new.all():
-                    repeated[each.asset] = each.times[~new]
-                rows += [each.rows[i] for i in np.flatnonzero(new)]
-            self._database.insert(connection, samples, rows)
-            latest = [each.state for each in packed if each.state]
+                    repeated[name] = times[~new]
+                inserted += [rows[i] for i in np.flatnonzero(new)]
+                latest += state
+            self._database.insert(connection, samples, inserted)
             if latest:
                 keys = [row[0] for row in latest]
                 connection.execute(states.delete().where(states.c.asset.in_(keys)))
@@ -213,8 +211,8 @@ class Store:
                 self._last = append(self._last, kind, data)
                 chained.append(self._last)
             self._database.insert(connection, log, [astuple(entry) for entry in chained])
-            for each in packed:
-                self._remove_surplus(connection, each.key)
+            for key, *_ in packed:
+                self._remove_surplus(connection, key)
         return Committed(repeated, chained)
 
     def samples(self, asset: str, after: int | None = None) -> Iterator[tuple[NDArray, NDArray]]:
@@ -333,18 +331,17 @@ class Store:
                 self._stale = True
                 raise
 
-    def _new(self, connection: Any, packed: Packed) -> NDArray:
+    def _new(self, connection: Any, key: int, times: NDArray) -> NDArray:
         """Whether each sample (n,) is neither stored nor repeated; it is counted as stored."""
-        times = packed.times
         if not len(times):
             return np.ones(0, dtype=bool)
-        held = self._held_by(connection, packed.key)
+        held = self._held_by(connection, key)
         if times[0] > held.latest and (np.diff(times) > 0).all():  # the usual case: no query
             new = np.ones(len(times), dtype=bool)
         else:
             new = np.zeros(len(times), dtype=bool)
             new[np.unique(times, return_index=True)[1]] = True
-            new &= ~np.isin(times, present(connection, packed.key, times))
+            new &= ~np.isin(times, present(connection, key, times))
         held.latest = max(held.latest, int(times.max()))
         held.count += int(new.sum())
         return new

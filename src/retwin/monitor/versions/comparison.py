@@ -118,7 +118,8 @@ def _of_samples(store: Store, twin: str, watching: Sequence[Any]) -> Scored:
             continue
         known = np.where(np.isfinite(seen[0].score) & np.isfinite(seen[1].score), measured, np.nan)
         found = [crps_normal(known, each.mean, each.deviation) for each in seen[:2]]
-        scores.append([_mean(each[0] / _deviation(measured[0])) for each in found])
+        relative = np.ma.masked_invalid(np.stack(found)[:, 0] / _deviation(measured[0]))
+        scores.append(relative.mean(axis=2).filled(np.nan))  # over the outputs that are measured
         alarms += [len(each.events) for each in seen]
     expected = f"at least {2 * MIN_SAMPLES} without an alarm, of one asset"
     require(scores, "samples", expected=expected, got="fewer", remedy=LATER)
@@ -142,8 +143,8 @@ def _of_trajectories(store: Store, twin: str, watching: Sequence[Any]) -> Scored
     every = [each for part in machines for each in part]
     what = "healthy ones that are stored, of all machines together"
     at_least("trajectories", every, MIN_TRAJECTORIES, what, remedy=LATER)
-    outputs = [np.where(each.mask, each.observed, np.nan)[0] for each in every]
-    unit = _deviation(np.concatenate(outputs).astype(float))
+    outputs = np.concatenate([each.measured[0] for each in every])
+    unit = _deviation(outputs.astype(float))
     twins = [_predicting(each) for each in watching[:2]]
     length = len(every) // BLOCKS
     scores: list[NDArray] = []
@@ -151,14 +152,6 @@ def _of_trajectories(store: Store, twin: str, watching: Sequence[Any]) -> Scored
         pairs = np.array([[_crps(own, each, unit) for each in part] for own in twins])
         scores += np.array_split(pairs, max(1, len(part) // length), axis=1)
     return scores, [_tested(each, machines) for each in watching[1:]]
-
-
-def _mean(scores: NDArray) -> NDArray:
-    """The mean over outputs (T, d_y) of those that are measured; NaN where none is."""
-    seen = np.isfinite(scores)
-    count = seen.sum(axis=1)
-    total = np.where(seen, scores, 0.0).sum(axis=1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def _machines(store: Store, twin: str) -> Iterator[tuple[str, int, Mapping[str, NDArray]]]:
@@ -169,7 +162,7 @@ def _machines(store: Store, twin: str) -> Iterator[tuple[str, int, Mapping[str, 
             yield asset.name, *state
 
 
-def _moments(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
+def log_times(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
     """The times of that name of the entries of some kinds of the log, by their assets."""
     found: dict[str, list[int]] = {}
     for entry in (each for kind in kinds for each in store.log(kind)):
@@ -180,7 +173,7 @@ def _moments(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
 
 def _healthy_samples(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
     """The healthy samples (T, d_u + d_y) of each asset of a twin."""
-    alarms, period = _moments(store, "time", "alarm", "remark", "end"), SECOND / monitor.twin.rate
+    alarms, period = log_times(store, "time", "alarm", "remark", "end"), SECOND / monitor.twin.rate
     for name, newest, _ in _machines(store, twin):
         first = newest - round(MAX_SAMPLES * period)
         times, rows = gridded(store, name, monitor.twin, first, newest)
@@ -209,7 +202,7 @@ def _healthy_trajectories(
 
     Those with nothing measured are left out.
     """
-    alarms, machines = _moments(store, "begin", "alarm"), list(_machines(store, twin))
+    alarms, machines = log_times(store, "begin", "alarm"), list(_machines(store, twin))
     for asset, _, state in machines:
         known = state.get("trajectories", np.zeros((0, 3), dtype=np.int64))
         ends = np.flatnonzero(np.isin(known[:, 0], alarms.get(asset, [])))
@@ -235,9 +228,7 @@ def _predicting(monitor: TrajectoryMonitor) -> Twin:
 
 def _deviation(measured: NDArray) -> NDArray:
     """The standard deviation (d_y,) of each output (T, d_y); 1 for one that is constant."""
-    seen = np.isfinite(measured).any(axis=0)
-    found = np.ones(measured.shape[1])
-    found[seen] = np.nanstd(measured[:, seen], axis=0)
+    found = np.ma.masked_invalid(measured).std(axis=0).filled(1.0)
     return np.where(found > 0, found, 1.0)
 
 
