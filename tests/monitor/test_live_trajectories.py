@@ -25,8 +25,7 @@ from retwin.errors import InputError
 from retwin.monitor import Explanations, Gate, Live, Registry, Samples, Store, export_log, verify
 from retwin.monitor.live.machine import Counts
 from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
-from retwin.monitor.models.trajectory.fitting import fit_trajectory_monitor
-from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
+from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor, fit_trajectory_monitor
 from retwin.monitor.program import run
 from retwin.monitor.server import create_app, listening, serving
 from retwin.monitor.settings import FolderSource, read_settings
