@@ -21,6 +21,7 @@ from typing import Protocol
 from retwin.checks import needs_extra, require
 from retwin.errors import brief
 from retwin.monitor.models.cause import cause_text
+from retwin.monitor.settings import NotifySettings, secret
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.store.store import Store
@@ -114,6 +115,14 @@ class Receiver:
     kinds: Sequence[str]
     assets: Sequence[str] = ()
     quiet: Sequence[tuple[time, time]] = ()
+
+    @classmethod
+    def of(cls, name: str, settings: NotifySettings) -> Receiver:
+        """Who is notified, as the settings state it."""
+        address = secret("address", settings.url_env)
+        channel = AppriseChannel(address) if address else FileChannel(settings.file)  # type: ignore[arg-type]
+        quiet = [tuple(map(time.fromisoformat, each.split("-"))) for each in settings.quiet]
+        return cls(name, channel, settings.kinds, settings.assets, quiet)  # type: ignore[arg-type]
 
     def hears(self, entry: Entry) -> bool:
         """Whether it is sent this entry."""
