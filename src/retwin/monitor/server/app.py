@@ -9,13 +9,14 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping
 from dataclasses import asdict
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+import fastapi
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 
 from retwin._version import __version__
-from retwin.checks import at_most, needs_extra
+from retwin.checks import at_most
 from retwin.errors import InputError
 from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.gate import Gate
@@ -29,11 +30,6 @@ from retwin.monitor.versions.comparison import Comparisons
 from retwin.monitor.versions.decision import Decision
 from retwin.monitor.versions.registry import Registry
 from retwin.report.figures.style import CHROME, PALETTE
-
-if TYPE_CHECKING:
-    import fastapi
-else:
-    fastapi = needs_extra("fastapi", "monitor", "answers requests")
 
 MIN_TOKEN_LENGTH = 16
 """Characters of a token at least."""

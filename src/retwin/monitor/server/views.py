@@ -8,12 +8,14 @@ import time
 import warnings
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
+from fastapi import Path, Query
+from fastapi.responses import JSONResponse
 from pydantic_core import to_jsonable_python
 
-from retwin.checks import given, needs_extra, require
+from retwin.checks import given, require
 from retwin.data.trajectories import HEALTHY
 from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.live import Live
@@ -36,11 +38,6 @@ from retwin.twins.faults.system_faults import (
 )
 from retwin.update.dynamics.filter.noise import CERTAIN
 
-if TYPE_CHECKING:
-    import fastapi
-else:
-    fastapi = needs_extra("fastapi", "monitor", "answers requests")
-
 SILENT = 20
 """Sample periods without a new sample after which an asset counts as stopped, 30 s at least."""
 SILENT_SECONDS = 30.0
@@ -50,11 +47,11 @@ after it."""
 KEPT = 16
 """Monitors that are kept in memory, besides those that watch."""
 
-Sequence = Annotated[int, fastapi.Path(ge=0, lt=2**63)]
-Number = Annotated[int, fastapi.Path(ge=1, lt=2**31)]
+Sequence = Annotated[int, Path(ge=0, lt=2**63)]
+Number = Annotated[int, Path(ge=1, lt=2**31)]
 
 
-class JSON(fastapi.responses.JSONResponse):
+class JSON(JSONResponse):
     """An answer in ASCII, with null for numbers that JSON does not have."""
 
     def render(self, content: Any) -> bytes:
@@ -168,8 +165,8 @@ class Views:
     def alarms(
         self,
         asset: str | None = None,
-        before: Annotated[int | None, fastapi.Query(ge=0, lt=2**63)] = None,
-        limit: Annotated[int, fastapi.Query(ge=1, le=500)] = 50,
+        before: Annotated[int | None, Query(ge=0, lt=2**63)] = None,
+        limit: Annotated[int, Query(ge=1, le=500)] = 50,
     ) -> Any:
         """Alarms with causes and acknowledgements, the newest first; `next` continues them."""
         found, following = self.journal.alarms(asset, before, limit)

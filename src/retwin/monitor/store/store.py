@@ -11,13 +11,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import instance, one_per, require, whole
-from retwin.monitor.store import database
 from retwin.monitor.store.audit import START, Entry, append, canonical
 from retwin.monitor.store.database import (
     Database,
@@ -25,6 +24,7 @@ from retwin.monitor.store.database import (
     last_entry,
     log,
     present,
+    sa,
     samples,
     states,
 )
@@ -40,11 +40,6 @@ from retwin.monitor.store.samples import (
 )
 from retwin.serialisation.files import refusing
 from retwin.serialisation.places import in_use
-
-if TYPE_CHECKING:
-    import sqlalchemy as sa
-else:
-    sa = database.sa
 
 FILE = "monitor.sqlite"
 """The database in the folder of the store, where no other is given."""
