@@ -13,6 +13,7 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime, time
 from pathlib import Path
@@ -165,12 +166,9 @@ class Notifications:
         for each in receivers:
             self._sent.setdefault(each.name, last.sequence if last else -1)
         self._write()
-        self._threads = [
-            threading.Thread(target=self._run, args=(each,), name=f"notify {each.name}")
-            for each in receivers
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._threads = ThreadPoolExecutor(max(1, len(receivers)), "notify")
+        for each in receivers:
+            self._threads.submit(self._run, each)
 
     def __enter__(self) -> Notifications:
         return self
@@ -181,8 +179,7 @@ class Notifications:
     def close(self) -> None:
         """Send what is new, and end the threads; what fails is sent after the next start."""
         self._stop.set()
-        for thread in self._threads:
-            thread.join()
+        self._threads.shutdown()
 
     def _run(self, receiver: Receiver) -> None:
         wait, failed, last = FIRST, False, False

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -244,7 +245,7 @@ def parse(
 
     """
     rows: dict[str, list[tuple[int, list[float]]]] = {}
-    known: dict[str, dict[str, int]] = {}
+    known = cache(lambda name: {channel: i for i, channel in enumerate(channels(name))})
     trajectories: list[Samples | Trajectory] = []
     count = 0
     needed = {"values"} if asset is not None else {"asset", "values"}
@@ -265,9 +266,8 @@ def parse(
         name = each.get("asset", asset)
         if not isinstance(name, str) or asset not in (None, name):
             raise _refused(f"{place}: asset", name, "its name" if asset is None else repr(asset))
-        if name not in known:
-            known[name] = {channel: i for i, channel in enumerate(channels(name))}
-        time, block = _time(each, place), _block(given, length, known[name], place)
+        places = known(name)
+        time, block = _time(each, place), _block(given, length, places, place)
         if length:
             trajectories.append(Trajectory(name, time, np.array(block)))
         else:
