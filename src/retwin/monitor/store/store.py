@@ -103,8 +103,11 @@ class Store:
             self._database = Database(self.folder / FILE, url, read_only=read_only)
             opened.callback(self._database.close)
             self._database.open()
-            if not read_only:
-                self._shrink()
+            if not read_only and max_samples is not None:
+                with self._writing() as connection:
+                    for key, _ in self._known(connection).values():
+                        self._remove_surplus(connection, key)
+                self._database.shrink()
             self._opened = opened.pop_all()
 
     def __enter__(self) -> Store:
@@ -363,15 +366,6 @@ class Store:
         last = connection.execute(times.limit(1).offset(place)).scalar_one()
         connection.execute(samples.delete().where(own, samples.c.time <= last))
         held.count = self._max_samples
-
-    def _shrink(self) -> None:
-        """Apply `max_samples` to all assets, and give free pages back."""
-        if self._max_samples is None:
-            return
-        with self._writing() as connection:
-            for key, _ in self._known(connection).values():
-                self._remove_surplus(connection, key)
-        self._database.shrink()
 
 
 @dataclass
