@@ -16,8 +16,7 @@ from retwin.monitor.detect.slack import Slack
 from retwin.monitor.models.cause import CauseSearch, find_causes, possible_causes
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.monitor_state import MonitorState
-from retwin.monitor.models.watched import Watched
+from retwin.monitor.models.state import MonitorState, Watched
 from retwin.twins import (
     ActuatorGain,
     Parameter,

@@ -33,10 +33,10 @@ from retwin.monitor.models.cause import (
 )
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import BEYOND, Monitor
+from retwin.monitor.models.state import SHARE, Alarm, Ending, Part, Visible
 from retwin.monitor.models.trajectory import monitor as trajectories
 from retwin.monitor.models.trajectory.evidence import Compared
 from retwin.monitor.models.trajectory.monitor import COMPARABLE, SHOWN, TrajectoryMonitor
-from retwin.monitor.models.watched import SHARE, Alarm, Ending, Part, Visible
 from retwin.monitor.server import journal, views
 from retwin.monitor.store.samples import Asset, Samples, Trajectory
 from retwin.monitor.versions import comparison

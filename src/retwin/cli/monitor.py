@@ -554,7 +554,7 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     from scipy.stats import poisson
 
     from retwin.monitor.detect.promise import duration, shortest
-    from retwin.monitor.models.watched import SHARE
+    from retwin.monitor.models.state import SHARE
     from retwin.report.labels import counted
 
     rate = monitor.twin.rate

@@ -25,7 +25,7 @@ from retwin.monitor.models.cause import (
     possible_causes,
 )
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.watched import Alarm
+from retwin.monitor.models.state import Alarm
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.gridded import gridded, record_of
 from retwin.monitor.store.samples import SECOND

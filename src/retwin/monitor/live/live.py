@@ -19,7 +19,7 @@ from retwin.monitor.live.stream_machine import StreamMachine, Work, step
 from retwin.monitor.live.trajectory_machine import TrajectoryMachine
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.monitor_state import Layout
+from retwin.monitor.models.state import Layout
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.gridded import Limits

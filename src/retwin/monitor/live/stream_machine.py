@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from retwin.monitor.live.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.monitor_state import Layout
-from retwin.monitor.models.watched import Watched
+from retwin.monitor.models.state import Layout, Watched
 from retwin.monitor.store.gridded import Limits
 from retwin.monitor.store.samples import EARLIEST, SECOND, Asset, Samples, Update
 

@@ -15,7 +15,7 @@ from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.inversion.fault_evidence import FaultEvidence
 from retwin.diagnosis.inversion.states import StateInversionDiagnoser
-from retwin.monitor.models.watched import Alarm
+from retwin.monitor.models.state import Alarm
 from retwin.progress import Progress, tracked
 from retwin.twins.faults.actuator_faults import Fault, ends_of
 from retwin.twins.faults.system_faults import (

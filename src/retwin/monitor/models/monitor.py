@@ -28,9 +28,8 @@ from retwin.monitor.detect.promise import Promise, Tried
 from retwin.monitor.detect.scores import ConformalScores, middle
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.detect.validity import Validity
-from retwin.monitor.models.monitor_state import MonitorState
 from retwin.monitor.models.saved import DISTURBANCE, read_fields, write_fields
-from retwin.monitor.models.watched import Alarm, Ending, Part, Visible, Watched
+from retwin.monitor.models.state import Alarm, Ending, MonitorState, Part, Visible, Watched
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.filter.online import OnlineFilter
 from retwin.update.dynamics.twin import BEYOND, DynamicsTwin

@@ -16,7 +16,7 @@ from retwin.monitor.detect.predictors import Predictor
 from retwin.monitor.detect.promise import Tried
 from retwin.monitor.detect.scores import ConformalScores
 from retwin.monitor.detect.slack import Slack
-from retwin.monitor.models.watched import Visible
+from retwin.monitor.models.state import Visible
 from retwin.serialisation.models import check_weights, read_model, refusing, write_model
 from retwin.update.dynamics.twin import DynamicsTwin
 

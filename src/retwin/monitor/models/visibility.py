@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.models.cause import output_ranges, size_unit
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.watched import SHARE, Visible
+from retwin.monitor.models.state import SHARE, Visible
 from retwin.progress import Progress, tracked
 from retwin.twins.collected import SimulationError
 from retwin.twins.faults.actuator_faults import Fault, Stuck
