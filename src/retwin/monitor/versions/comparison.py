@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -240,20 +240,6 @@ def _crps(twin: Twin, record: Trajectories, unit: NDArray) -> float:
     return float(found[record.mask[0]].mean())
 
 
-@dataclass(eq=False)
-class _Made:
-    """A comparison, and until when it is kept once it is done."""
-
-    future: Future[Decision]
-    begun: float = field(default_factory=time.monotonic)
-    until: float = float("inf")
-
-    def done(self, _: object) -> None:
-        """Note that it is done."""
-        now = time.monotonic()
-        self.until = now + max(FRESH, PATIENCE * (now - self.begun))
-
-
 class Comparisons:
     """Comparisons in a thread of their own, one after the other, each kept for a while.
 
@@ -267,18 +253,26 @@ class Comparisons:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._worker = ThreadPoolExecutor(1, "comparison")
-        self._made: dict[tuple[str, int], _Made] = {}
+        self._made: dict[tuple[str, int], Future[Decision]] = {}
+        self._until: dict[Future[Decision], float] = {}
+        """Until when a comparison is kept that is done."""
         self._lock = threading.Lock()
 
     def of(self, twin: str, number: int) -> Future[Decision]:
         """The comparison of a version with the active one."""
         key, now = (twin, number), time.monotonic()
         with self._lock:
-            self._made = {each: made for each, made in self._made.items() if now < made.until}
+            for each, made in list(self._made.items()):
+                if now >= self._until.get(made, np.inf):
+                    del self._made[each], self._until[made]
             if key not in self._made:
                 count = len(self._made) + 1
                 at_most("comparison", count, QUEUE, "at a time", remedy="wait for a minute")
-                made = _Made(self._worker.submit(compare, self._store, twin, number))
-                self._made[key] = made
-                made.future.add_done_callback(made.done)
-            return self._made[key].future
+                self._made[key] = self._worker.submit(compare, self._store, twin, number)
+                self._made[key].add_done_callback(partial(self._keep, now))
+            return self._made[key]
+
+    def _keep(self, begun: float, made: Future[Decision]) -> None:
+        """Note until when a comparison is kept."""
+        now = time.monotonic()
+        self._until[made] = now + max(FRESH, PATIENCE * (now - begun))
