@@ -116,11 +116,8 @@ class _News:
     """Reports the entries that are new in the log."""
 
     def __init__(self, store: Store, report: Callable[[str], None]) -> None:
-        self._store = store
-        self._report = report
-        last = store.last
-        self._last = last.sequence if last else -1
-        self._failed = False
+        self._store, self._report, self._failed = store, report, False
+        self._last = last.sequence if (last := store.last) else -1
 
     def read(self) -> None:
         """Report them; a store that cannot be read is reported once, and read again later."""

@@ -331,14 +331,10 @@ class Monitor:
         rows, first = np.flatnonzero(anew), model.start()
         filters = []
         for online, own in zip(self._filters, state.filters, strict=True):
-            new, old = online.start(len(rows)), own.of(rows)
-            kept = {name: getattr(old, name) for name in ("commands", "simulated")}
-            learned = ~changed[rows]
-            for name in ("centre", "root"):
-                values = getattr(new, name)
-                values[learned] = getattr(old, name)[learned]
-                kept[name] = values
-            filters.append(own.merged(rows, replace(new, **kept)))
+            old, same = own.of(rows), np.flatnonzero(~changed[rows])
+            new = replace(online.start(len(rows)), commands=old.commands, simulated=old.simulated)
+            learned = replace(new, centre=old.centre, root=old.root).of(same)
+            filters.append(own.merged(rows, new.merged(same, learned)))
         where = np.repeat(anew, each)
         scale = np.where(np.repeat(changed, each)[:, None], 0.0, state.scale)
         disturbance = DisturbanceState(
