@@ -18,7 +18,7 @@ from retwin.monitor.detect.validity import ValidityState
 from retwin.update.dynamics.filter.online import FilterState
 
 Kind = TypeVar("Kind")
-PARTS = ("disturbance", "detector", "validity")
+PARTS = {"disturbance": DisturbanceState, "detector": DetectorState, "validity": ValidityState}
 """What the state of a monitor has of each stream."""
 SHARE = 0.9
 """Share of onsets after which a fault must have raised an alarm."""
@@ -75,14 +75,11 @@ class MonitorState:
             if key.split(".")[0] in (*PARTS, "scale"):  # a row of each stream
                 rows[key] = each.reshape(-1, *each.shape[2:])
         filters = takewhile(lambda name: f"{name}.states" in rows, map(_filter, count()))
-        return cls(
-            tuple(part_of(FilterState, name, rows) for name in filters),
-            part_of(DisturbanceState, "disturbance", rows),
-            part_of(DetectorState, "detector", rows),
-            part_of(ValidityState, "validity", rows),
-            part_of(Course, "course", rows),
-            *(rows[name] for name in ("changes", "scale", "void")),
-        )
+        every = tuple(part_of(FilterState, name, rows) for name in filters)
+        parts: dict[str, Any] = {name: rows[name] for name in ("changes", "scale", "void")}
+        for name, kind in {**PARTS, "course": Course}.items():
+            parts[name] = part_of(kind, name, rows)
+        return cls(every, **parts)
 
 
 class Layout:
