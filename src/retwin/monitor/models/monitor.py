@@ -103,17 +103,9 @@ class Monitor:
     @property
     def promises(self) -> dict[str, Promise]:
         """What is promised of each output."""
-        outputs = self.twin.outputs.names
-        return {
-            name: Promise(
-                self.run_length,
-                self.twin.rate,
-                self.slack[i],
-                self.alpha,
-                self.slack[i + len(outputs) :: len(outputs)],
-            )
-            for i, name in enumerate(outputs)
-        }
+        names, about = self.twin.outputs.names, (self.run_length, self.twin.rate)
+        classes = {name: self.slack[i :: len(names)] for i, name in enumerate(names)}
+        return {name: Promise(*about, own[0], self.alpha, own[1:]) for name, own in classes.items()}
 
     @property
     def run_length(self) -> float:
