@@ -314,7 +314,10 @@ def is_due(inferred: Sequence[int], sample: int) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class CauseSearch:
-    """A search for the causes of alarms in a record of one trajectory; see `find_causes`."""
+    """A search for the causes of alarms in a record of one trajectory.
+
+    Its attributes are the parameters of `find_causes`.
+    """
 
     twin: DynamicsTwin
     record: Trajectories
