@@ -162,7 +162,7 @@ def _machines(store: Store, twin: str) -> Iterator[tuple[str, int, Mapping[str, 
             yield asset.name, *state
 
 
-def log_times(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
+def collect_times(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
     """The times of that name of the entries of some kinds of the log, by their assets."""
     found: dict[str, list[int]] = {}
     for entry in (each for kind in kinds for each in store.log(kind)):
@@ -173,7 +173,10 @@ def log_times(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
 
 def _healthy_samples(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
     """The healthy samples (T, d_u + d_y) of each asset of a twin."""
-    alarms, period = log_times(store, "time", "alarm", "remark", "end"), SECOND / monitor.twin.rate
+    alarms, period = (
+        collect_times(store, "time", "alarm", "remark", "end"),
+        SECOND / monitor.twin.rate,
+    )
     for name, newest, _ in _machines(store, twin):
         first = newest - round(MAX_SAMPLES * period)
         times, rows = gridded(store, name, monitor.twin, first, newest)
@@ -202,7 +205,7 @@ def _healthy_trajectories(
 
     Those with nothing measured are left out.
     """
-    alarms, machines = log_times(store, "begin", "alarm"), list(_machines(store, twin))
+    alarms, machines = collect_times(store, "begin", "alarm"), list(_machines(store, twin))
     for asset, _, state in machines:
         known = state.get("trajectories", np.zeros((0, 3), dtype=np.int64))
         ends = np.flatnonzero(np.isin(known[:, 0], alarms.get(asset, [])))
