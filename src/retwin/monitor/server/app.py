@@ -27,7 +27,6 @@ from retwin.monitor.server.metrics import Metrics
 from retwin.monitor.server.views import JSON, Number, Sequence, Views
 from retwin.monitor.store.samples import parse
 from retwin.monitor.versions.comparison import Comparisons
-from retwin.monitor.versions.decision import Decision
 from retwin.monitor.versions.registry import Registry
 from retwin.report.figures.style import CHROME, PALETTE
 
@@ -287,15 +286,12 @@ def _add_versions(app: fastapi.FastAPI, live: Live, views: Views) -> None:
         twin: str, number: Number, step: Literal["promote", "shadow", "reject"], body: Step
     ) -> Any:
         """Change the state of a version; one is promoted that is better than the active one."""
-        registry = Registry(live.store, twin)
+        registry, why = Registry(live.store, twin), list[Any]()
+        if step == "promote" and registry.active is not None:
+            why.append(await asyncio.wrap_future(comparisons.of(twin, number)))
+        elif step == "reject":
+            why.append(body.reason)
+        made = await asyncio.to_thread(getattr(registry, step), number, *why)
         if step == "promote":
-            evidence: Decision | None = None
-            if registry.active is not None:
-                evidence = await asyncio.wrap_future(comparisons.of(twin, number))
-            made = await asyncio.to_thread(registry.promote, number, evidence)
             await asyncio.to_thread(live.refresh)
-        elif step == "shadow":
-            made = await asyncio.to_thread(registry.shadow, number)
-        else:
-            made = await asyncio.to_thread(registry.reject, number, body.reason)
         return JSON(vars(made))
