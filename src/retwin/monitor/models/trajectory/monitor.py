@@ -22,7 +22,7 @@ from retwin.data.trajectories import HEALTHY, UNKNOWN, Trajectories
 from retwin.diagnosis.diagnoser import load_diagnoser
 from retwin.errors import InputError
 from retwin.monitor.detect.detector import LARGEST, Detector
-from retwin.monitor.detect.offsets import OffsetModel, biases, fit_offsets, is_bias
+from retwin.monitor.detect.offsets import SIZES, OffsetModel, biases, fit_offsets, is_bias
 from retwin.monitor.detect.promise import (
     MAX_RUN_LENGTH,
     MIN_RUN_LENGTH,
@@ -157,19 +157,16 @@ class TrajectoryMonitor:
         return {"trajectories": self.promise}
 
     @cached_property
-    def _tests(self) -> tuple[Detector, Validity]:
-        detector = Detector(self.slack)
-        return detector, Validity(detector, self.arl, self.alpha)
+    def _validity(self) -> Validity:
+        return Validity(Detector(self.slack), self.arl, self.alpha)
 
     def start(self) -> TrajectoryState:
         """What is known of a machine before its first trajectory."""
-        detector, validity = self._tests
-        own = np.zeros(len(alternatives(self.diagnoser)))
-        pooled = np.zeros((0, 0))
+        own, pooled = np.zeros(len(alternatives(self.diagnoser))), np.zeros((0, 0))
         if self.offsets is not None:
-            none = np.zeros((1, 0, len(self.offsets.mean)))
-            pooled = np.zeros_like(self.offsets.ratio(none, self.diagnoser.faults.values())[0])
-        return TrajectoryState(own, pooled, detector.start(1), validity.start(1))
+            pooled = np.zeros((len(biases(self.diagnoser.faults.values())), len(SIZES)))
+        tests = self._validity.detector.start(1), self._validity.start(1)
+        return TrajectoryState(own, pooled, *tests)
 
     def watch(
         self,
@@ -208,7 +205,7 @@ class TrajectoryMonitor:
         alarms = []
         for t, steps in enumerate(self._factors(found)):
             state, evidence[t], shares = self._step(state, steps, low[:, t], high[:, t])
-            void[t] = self._tests[1].void(state.validity)[0]
+            void[t] = self._validity.void(state.validity)[0]
             if shares:
                 name, probability = next(iter(shares.items()))
                 about = str(trajectories.ids[t]), state.count - 1, name, float(evidence[t])
@@ -243,12 +240,12 @@ class TrajectoryMonitor:
         high: NDArray,
     ) -> tuple[TrajectoryState, float, dict[str, float]]:
         """The state after a trajectory, the evidence, and at an alarm the shares of its causes."""
-        detector, validity = self._tests
+        validity = self._validity
         own, pooled = (
             before if factor is None else np.minimum((before + 1) * factor, LARGEST)
             for before, factor in zip((state.evidence, state.pooled), step, strict=True)
         )
-        detected, against = detector.step(state.detector, low, high)
+        detected, against = validity.detector.step(state.detector, low, high)
         parts = [own.mean(), against[0], *([pooled.mean()] if pooled.size else [])]
         evidence = float(np.mean(parts))
         alarm = evidence >= self.arl
@@ -256,7 +253,7 @@ class TrajectoryMonitor:
         shares = self._shares(own, pooled, against[0]) if alarm else {}
         if alarm:
             own, pooled = np.zeros_like(own), np.zeros_like(pooled)
-        detected = detector.reset(detected, np.array([alarm]))
+        detected = validity.detector.reset(detected, np.array([alarm]))
         return TrajectoryState(own, pooled, detected, tested, state.count + 1), evidence, shares
 
     def _shares(self, own: NDArray, pooled: NDArray, against: float) -> dict[str, float]:
