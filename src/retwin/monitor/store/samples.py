@@ -266,8 +266,8 @@ def parse(
         name = each.get("asset", asset)
         if not isinstance(name, str) or asset not in (None, name):
             raise _refused(f"{place}: asset", name, "its name" if asset is None else repr(asset))
-        places = known(name)
-        time, block = _time(each, place), _block(given, length, places, place)
+        order = known(name)
+        time, block = _time(each, place), _block(given, length, order, place)
         if length:
             trajectories.append(Trajectory(name, time, np.array(block)))
         else:
@@ -336,12 +336,10 @@ def _block(values: Any, length: int, places: dict[str, int], place: str) -> list
             raise _refused(f"{place}: values", name, expected, remedy)
         column, several = value if length else [value], isinstance(value, list)
         if length and not (several and len(value) == length):
-            raise InputError(
-                f"{place}: {repr(name)[:60]}",
-                expected=f"an array of {length} numbers, as another channel has",
-                got=str(len(value)) if several else repr(value)[:60],
-                remedy="send one value per sample of each channel, null where it is missing",
-            )
+            got, expected = len(value) if several else value, f"an array of {length} numbers"
+            remedy = "send one value per sample of each channel, null where it is missing"
+            where = f"{place}: {repr(name)[:60]}"
+            raise _refused(where, got, f"{expected}, as another channel has", remedy)
         for row, each in zip(made, column, strict=True):
             try:
                 if not isinstance(each, int | float | None):
