@@ -162,12 +162,12 @@ def _slower(
 
 
 def _calibrated(
-    twin: DynamicsTwin, healthy: Trajectories, measured: NDArray, steps: NDArray, own: Predictor
+    twin: DynamicsTwin, healthy: Trajectories, measured: NDArray, steps: NDArray, model: Predictor
 ) -> _Calibrated | None:
     """A model with the effect of the record that fits best; None if it does not stay finite."""
     given, best, found = (healthy.commands.astype(float), measured, healthy.mask), -np.inf, None
     for effect in EFFECTS:
-        online = replace(own, effect=effect).filter(twin)
+        online = replace(model, effect=effect).filter(twin)
         _, mean, covariance = online.step(online.start(len(healthy)), *given)
         if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
             continue
@@ -177,13 +177,13 @@ def _calibrated(
     if found is None:
         return None
     effect, online, mean, covariance = found
-    warm_up = settled(own.filter(twin), len(healthy), given)
+    warm_up = settled(model.filter(twin), len(healthy), given)
     counted = (np.arange(healthy.steps) >= warm_up)[None, :, None]
     errors = standardised(measured - mean, covariance, healthy.mask & counted, steps)
     count, d_u = len(healthy), healthy.commands.shape[2]
     before = np.zeros((count, len(DECAYS), d_u)), np.full((count, d_u), np.nan)
     noted = features(*before, given[0], mean, span_of(twin))[1]
-    known = replace(own, warm_up=warm_up / twin.rate, effect=effect)
+    known = replace(model, warm_up=warm_up / twin.rate, effect=effect)
     return _Calibrated(known, *errors, noted)
 
 

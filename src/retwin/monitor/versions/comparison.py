@@ -173,10 +173,8 @@ def collect_times(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
 
 def _healthy_samples(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
     """The healthy samples (T, d_u + d_y) of each asset of a twin."""
-    alarms, period = (
-        collect_times(store, "time", "alarm", "remark", "end"),
-        SECOND / monitor.twin.rate,
-    )
+    alarms = collect_times(store, "time", "alarm", "remark", "end")
+    period = SECOND / monitor.twin.rate
     for name, newest, _ in _machines(store, twin):
         first = newest - round(MAX_SAMPLES * period)
         times, rows = gridded(store, name, monitor.twin, first, newest)
