@@ -15,7 +15,7 @@ import retwin as rt
 from retwin.cli.monitor import _event_rows
 from retwin.monitor import Alarm, Monitor
 from retwin.monitor.models.cause import Cause, cause_text
-from retwin.monitor.models.watched import Visible
+from retwin.monitor.models.state import Visible
 from retwin.twins import ParameterShift
 from retwin.update import DynamicsTwin, StationaryNoise
 

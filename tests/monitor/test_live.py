@@ -32,7 +32,7 @@ from retwin.monitor.live.explanations import _Turns
 from retwin.monitor.live.machine import Counts
 from retwin.monitor.live.stream_machine import PLACES, StreamMachine
 from retwin.monitor.models.cause import is_due
-from retwin.monitor.models.monitor_state import Layout
+from retwin.monitor.models.state import Layout
 from retwin.monitor.program import _offer
 from retwin.monitor.settings import TwinSettings
 from retwin.monitor.store.audit import Entry

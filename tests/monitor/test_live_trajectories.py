@@ -25,12 +25,11 @@ from retwin.errors import InputError
 from retwin.monitor import Explanations, Gate, Live, Registry, Samples, Store, export_log, verify
 from retwin.monitor.live.machine import Counts
 from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
-from retwin.monitor.models.trajectory.fitting import fit_trajectory_monitor
-from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
+from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor, fit_trajectory_monitor
 from retwin.monitor.program import run
 from retwin.monitor.server import create_app, listening, serving
 from retwin.monitor.settings import FolderSource, read_settings
-from retwin.monitor.sources.folder import Recorded, TrajectoryFolder
+from retwin.monitor.sources.folder import TrajectoryFolder
 from retwin.monitor.store.samples import SECOND, Trajectory, parse
 from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics
@@ -203,7 +202,7 @@ def test_others_go_on_while_a_trajectory_is_diagnosed(
     begun, resume, times = threading.Event(), threading.Event(), []
     diagnose = TrajectoryMachine.diagnose
 
-    def slow(machine: TrajectoryMachine, given: Trajectory) -> Diagnosed:
+    def slow(machine: TrajectoryMachine, given: Trajectory) -> Diagnosed | str:
         times.append(machine.asset.version)
         begun.set()
         assert resume.wait(60)
@@ -279,7 +278,7 @@ def test_files_are_read_once_they_are_complete(
     half = len(table) // 2
     (tmp_path / "logs" / "b.csv").write_text("time,pump,level\n" + table[:half])
     with opened() as live, Gate(live) as gate:
-        source = TrajectoryFolder(settings, {"a": Recorded(monitor)}, {}, lines.append)
+        source = TrajectoryFolder(settings, {"a": (monitor, None)}, {}, lines.append)
         with running(source, gate):
             (tmp_path / "logs" / "bad.npz").write_bytes(b"PK")
             sleep(0.1)
@@ -294,7 +293,7 @@ def test_files_are_read_once_they_are_complete(
             wait(lambda: sum("refused" in line for line in lines) == 1, lines)
         files = stored(live.store)
         again = TrajectoryFolder(
-            settings, {"a": Recorded(monitor)}, {"a": live.status()[0].time}, lines.append
+            settings, {"a": (monitor, None)}, {"a": live.status()[0].time}, lines.append
         )
         with running(again, gate):
             wait(lambda: sum("refused" in line for line in lines) == 2, lines)

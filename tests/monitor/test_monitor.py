@@ -13,11 +13,10 @@ from retwin.monitor.detect.detector import Detector
 from retwin.monitor.detect.events import FOLLOWS
 from retwin.monitor.detect.predictors import SLOWER, agreeing
 from retwin.monitor.detect.slack import Slack
-from retwin.monitor.models.cause import find_cause, find_causes, possible_causes
+from retwin.monitor.models.cause import CauseSearch, find_causes, possible_causes
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.monitor_state import MonitorState
-from retwin.monitor.models.watched import Watched
+from retwin.monitor.models.state import MonitorState, Watched
 from retwin.twins import (
     ActuatorGain,
     Parameter,
@@ -337,7 +336,7 @@ def test_a_wrong_cause_is_replaced_by_the_one_that_explains_the_event(monitor: M
     alarms = [first, next(each for each in further if each.sample - first.sample > 10)]
     causes, other = possible_causes(monitor.twin), "pump: another effect"
     for current, same in ((other, False), ("drain changed", True)):
-        cause = find_cause(monitor.twin, leaking, alarms, causes, current=(current, 0.0))
+        cause = CauseSearch(monitor.twin, leaking, causes).find(alarms, (current, 0.0))
         assert (cause.name, cause.same, cause.unit) == ("drain changed", same, "1/s")
         assert cause.size[1] < 1.3 < cause.size[2]
     assert cause.onset[0] < first.time

@@ -22,13 +22,21 @@ from retwin.monitor.live.machine import AssetStatus, Counts
 from retwin.monitor.live.stream_machine import BEHIND, TOLERATED, WINDOW, StreamMachine, Work
 from retwin.monitor.live.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.models import cause, visibility
-from retwin.monitor.models.cause import MIN_WINDOW, PROBABLE, Cause, cause_data, cause_text, is_due
+from retwin.monitor.models.cause import (
+    MIN_WINDOW,
+    PROBABLE,
+    Cause,
+    CauseSearch,
+    cause_data,
+    cause_text,
+    is_due,
+)
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import BEYOND, Monitor
+from retwin.monitor.models.state import SHARE, Alarm, Ending, Part, Visible
 from retwin.monitor.models.trajectory import monitor as trajectories
 from retwin.monitor.models.trajectory.evidence import Compared
 from retwin.monitor.models.trajectory.monitor import COMPARABLE, SHOWN, TrajectoryMonitor
-from retwin.monitor.models.watched import SHARE, Alarm, Ending, Part, Visible
 from retwin.monitor.server import journal, views
 from retwin.monitor.store.samples import Asset, Samples, Trajectory
 from retwin.monitor.versions import comparison
@@ -519,19 +527,14 @@ def found_cause(
     monkeypatch.setattr(cause, "StateInversionDiagnoser", Diagnoser)
     monkeypatch.setattr(cause, "moved", lambda twin, _: twin)
     monkeypatch.setattr(cause, "size_unit", lambda *_: "")
-    monkeypatch.setattr(cause, "_better", lambda *_: better)
+    monkeypatch.setattr(CauseSearch, "_better", lambda *_: better)
     alarms = [Alarm("0", each, float(each), "level", "", 1e6, samples[0]) for each in samples]
     if earlier is not None:
         alarms.insert(0, Alarm("0", earlier, float(earlier), "level", "", 1e6, earlier))
     faults = {"Healthy": None, "leak": LEAK, "pump": PUMP}
     record = recorded(0)
-    made = cause.find_cause(
-        None,  # type: ignore[arg-type]
-        record,
-        alarms,
-        faults,
-        current=(current, unexplained),
-    )
+    search = CauseSearch(None, record, faults)  # type: ignore[arg-type]
+    made = search.find(alarms, (current, unexplained))
     if found is not None:
         found |= vars(made)
     return made.same, steps
@@ -621,13 +624,11 @@ def test_alarms_at_which_nothing_is_inferred_have_the_cause_of_their_event(
     """An event of any length has few inferences; the next one begins after its last alarm."""
     asked: list[list[int]] = []
 
-    def found(
-        _twin: object, _record: object, alarms: list[Alarm], *_: object, **__: object
-    ) -> Cause:
+    def found(_search: object, alarms: list[Alarm], *_: object) -> Cause:
         asked.append([each.sample for each in alarms])
         return Cause(alarms[-1], f"{len(asked)}", 1.0, 0.0, *[(0.0,) * 3] * 2, {}, len(asked) == 2)
 
-    monkeypatch.setattr(cause, "find_cause", found)
+    monkeypatch.setattr(CauseSearch, "find", found)
     record = recorded(0)
     (name,) = record.ids.tolist()
     alarms = [Alarm(name, each, float(each), "level", "", 1e6, 200) for each in range(200, 380, 5)]
@@ -678,8 +679,8 @@ def test_another_fault_has_more_evidence_than_the_first_alone(
     monkeypatch.setattr(cause, "FaultEvidence", SimpleNamespace(of=lambda *_, **__: Model()))
     monkeypatch.setattr(cause, "moved", lambda twin, _: twin)
     window = (100, begin, Alarm("0", 310, 310.0, "level", "", 1e6, 200))
-    given = None, recorded(0), window, (LEAK, PUMP), 2.0, instead is not None
-    assert cause._better(*given) is better  # type: ignore[arg-type]
+    search = CauseSearch(None, recorded(0), {})  # type: ignore[arg-type]
+    assert search._better(window, (LEAK, PUMP), 2.0, instead is not None) is better
 
 
 # What a monitor sees.

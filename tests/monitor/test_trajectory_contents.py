@@ -11,8 +11,7 @@ from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor.detect.offsets import OffsetModel, fit_offsets
 from retwin.monitor.models.trajectory.evidence import checked
-from retwin.monitor.models.trajectory.fitting import fit_trajectory_monitor
-from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
+from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor, fit_trajectory_monitor
 from retwin.monitor.models.trajectory.state import TrajectoryState
 from retwin.twins import ActuatorGain, ParameterShift
 from retwin.twins.faults.actuator_faults import ActuatorBias

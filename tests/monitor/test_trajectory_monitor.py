@@ -10,8 +10,7 @@ import pytest
 import retwin as rt
 from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.errors import InputError
-from retwin.monitor.models.trajectory.fitting import fit_trajectory_monitor
-from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
+from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor, fit_trajectory_monitor
 from retwin.twins import ActuatorGain, Parameter, ParameterShift, SensorBias, State, StateTwin
 from retwin.twins.faults.actuator_faults import Fault
 from retwin.update import Dynamics, Library, fit_dynamics

@@ -12,8 +12,7 @@ from monitor.test_trajectory_monitor import NOISE, TANK, runs
 from retwin.diagnosis.inversion.states import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor import Live, Registry, Store, compare, fit_monitor, verify
-from retwin.monitor.models.trajectory.fitting import fit_trajectory_monitor
-from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
+from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor, fit_trajectory_monitor
 from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics
 

@@ -458,7 +458,7 @@ def _event_rows(
     Events of a record that follow one with the same cause are in the row of that: a fault that
     lasts may not show for a while.
     """
-    from retwin.monitor.models.cause import PROBABLE, cause_text
+    from retwin.monitor.models.cause import cause_text
     from retwin.report.labels import significant
 
     def text(cause: Cause) -> str:
@@ -484,7 +484,7 @@ def _event_rows(
                 named[-1] = cause  # the same from more samples
             newest = cause
         if named and newest.name not in [HEALTHY, *(each.name for each in named)]:
-            named += [newest] * (newest.probability * (1 - newest.unknown) > PROBABLE)
+            named += [newest] * newest.likely
         end = ends.get((first.trajectory, first.event))
         until = "lasts" if end is None else f"{end.sample / rate:.6g}"
         what = ("" if first.promised else "remark: ") + f"{first.output} {first.change}"
@@ -554,7 +554,7 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     from scipy.stats import poisson
 
     from retwin.monitor.detect.promise import duration, shortest
-    from retwin.monitor.models.watched import SHARE
+    from retwin.monitor.models.state import SHARE
     from retwin.report.labels import counted
 
     rate = monitor.twin.rate

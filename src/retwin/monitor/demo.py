@@ -23,7 +23,7 @@ from retwin.monitor.live.gate import Gate
 from retwin.monitor.live.live import Live
 from retwin.monitor.models.fitting import fit_monitor
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.store.samples import Samples
+from retwin.monitor.store.samples import SECOND, Samples, Trajectory
 from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 from retwin.twins.commands.samplers import HoldSampler
@@ -148,9 +148,7 @@ def _stream(gate: Gate, stop: threading.Event) -> None:
     record = emulated(2 * DURATION, 1, [fault for _, fault in MACHINES.values()])
     values = np.concatenate([record.commands, record.observed], axis=2)
     began, begin, sent = time.monotonic(), time.time() - DURATION, 0
-    times = np.int64(begin * 1e9) + np.round(np.arange(record.steps) / record.rate * 1e9).astype(
-        np.int64
-    )
+    times = Trajectory("", int(begin * SECOND), values[0]).samples(record.rate).times
     while sent < record.steps and not stop.wait(PAUSE):
         due = min(SPEED * (time.monotonic() - began), time.time() - begin)
         new = slice(sent, int(due * record.rate) + 1)

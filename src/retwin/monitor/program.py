@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from datetime import time
 from functools import partial
 from typing import Any
 
@@ -17,13 +16,7 @@ from retwin.errors import InputError
 from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.gate import Gate
 from retwin.monitor.live.live import Live
-from retwin.monitor.live.notifications import (
-    AppriseChannel,
-    FileChannel,
-    Notifications,
-    Receiver,
-    sentence,
-)
+from retwin.monitor.live.notifications import Notifications, Receiver, sentence
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.server import create_app, listening, serving
@@ -32,7 +25,6 @@ from retwin.monitor.settings import (
     FolderSource,
     MonitorSettings,
     MqttSource,
-    NotifySettings,
     TwinSettings,
     secret,
 )
@@ -93,7 +85,7 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
         systems = {name: known[each.twin] for name, each in settings.assets.items()}
         faults = {name: each.alarm_causes for name, each in known.items() if each}
         explanations = opened.enter_context(Explanations(live, faults.get))
-        receivers = [_receiver(name, each) for name, each in settings.notify.items()]
+        receivers = [Receiver.of(name, each) for name, each in settings.notify.items()]
         opened.enter_context(Notifications(store, receivers, report))
         gate = opened.enter_context(Gate(live))
         made = [_sources(each, live, systems, report) for each in settings.sources]
@@ -124,11 +116,8 @@ class _News:
     """Reports the entries that are new in the log."""
 
     def __init__(self, store: Store, report: Callable[[str], None]) -> None:
-        self._store = store
-        self._report = report
-        last = store.last
-        self._last = last.sequence if last else -1
-        self._failed = False
+        self._store, self._report, self._failed = store, report, False
+        self._last = last.sequence if (last := store.last) else -1
 
     def read(self) -> None:
         """Report them; a store that cannot be read is reported once, and read again later."""
@@ -159,14 +148,6 @@ def _offer(registry: Registry, twin: TwinSettings, report: Callable[[str], None]
         number = {each.digest: each.number for each in registry.versions()}[sha256(folder)]
         registry.promote(number)
         report(f"twin {registry.twin}: {twin.monitor} is version {number}")
-
-
-def _receiver(name: str, settings: NotifySettings) -> Receiver:
-    """Who is notified, as the settings state it."""
-    address = secret("address", settings.url_env)
-    channel = AppriseChannel(address) if address else FileChannel(settings.file)  # type: ignore[arg-type]
-    quiet = [tuple(map(time.fromisoformat, each.split("-"))) for each in settings.quiet]
-    return Receiver(name, channel, settings.kinds, settings.assets, quiet)  # type: ignore[arg-type]
 
 
 def _sources(
@@ -206,7 +187,7 @@ def _folders(
     for name in [settings.asset] if settings.asset else systems:
         monitor, case = live.monitor(name), systems[name]
         if isinstance(monitor, TrajectoryMonitor):
-            recorded[name] = Recorded(monitor, case)
+            recorded[name] = monitor, case
         else:
             require(
                 settings.files.endswith((".csv", ".parquet")),

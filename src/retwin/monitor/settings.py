@@ -226,15 +226,14 @@ class MonitorSettings(Part):
         for name, asset in self.assets.items():
             if asset.twin not in self.twins:
                 raise ValueError(f"a table [twins.{asset.twin}], which the asset {name} names")
-        for receiver in self.notify.values():
-            for name in receiver.assets:
-                if name not in self.assets:
-                    raise ValueError(f"a table [assets.{name}], which [notify] names")
+        named = [("[notify]", name) for each in self.notify.values() for name in each.assets]
         for source in self.sources:
             asked = getattr(source, "asset", None)
-            for name in getattr(source, "nodes", [asked] if asked else []):
-                if name not in self.assets:
-                    raise ValueError(f"a table [assets.{name}], which a source names")
+            known = getattr(source, "nodes", [asked] if asked else [])
+            named += [("a source", name) for name in known]
+        for who, name in named:
+            if name not in self.assets:
+                raise ValueError(f"a table [assets.{name}], which {who} names")
         if re.match(r"[^/]*//[^/@]*:[^/@]*@", self.url):
             raise ValueError("a url without a password")
         return self

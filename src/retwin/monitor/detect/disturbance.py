@@ -116,14 +116,8 @@ class Disturbance:
         mean = state.mean.T.copy()
         covariance = np.moveaxis(state.covariance, 0, -1).copy()
         errors, deviation = np.empty((2, *given.shape[::-1]))
-        filtered = _errors(
-            given.T - self.mean,
-            self.coefficients.T,
-            self.process,
-            self.measurement,
-            mean,
-            covariance,
-        )
+        model = self.coefficients.T, self.process, self.measurement
+        filtered = _errors(given.T - self.mean, model, mean, covariance)
         for t, (error, variance) in enumerate(filtered):
             deviation[t] = np.sqrt(variance)
             errors[t] = error / deviation[t]
@@ -200,18 +194,18 @@ def fit_disturbance(
     return Disturbance(coefficients.T, mean, variance, variance * ratio, errors.T, spread)
 
 
+Model = tuple[NDArray, NDArray | float, NDArray]
+"""Coefficients (p, ..., streams), and variances of process and measurement noise (..., streams)."""
+
+
 def _errors(
-    values: NDArray,
-    coefficients: NDArray,
-    process: NDArray | float,
-    measurement: NDArray,
-    mean: NDArray,
-    covariance: NDArray,
+    values: NDArray, model: Model, mean: NDArray, covariance: NDArray
 ) -> Iterator[tuple[NDArray, NDArray]]:
     """Errors and their variances (..., streams), sample by sample; mean and covariance change.
 
-    Shapes: values (T, streams), coefficients (p, ..., streams), covariance (p, p, ..., streams).
+    Shapes: values (T, streams), covariance (p, p, ..., streams).
     """
+    coefficients, process, measurement = model
     order = len(coefficients)
     for value in values:
         error = value - mean[0]
@@ -267,20 +261,22 @@ def _model(point: NDArray) -> tuple[NDArray, NDArray]:
     return _coefficients(partial), np.exp(np.clip(point[-1], *RATIOS))
 
 
+def _errors_at(point: NDArray, blocks: NDArray) -> Iterator[tuple[NDArray, NDArray]]:
+    """See `_errors`: of blocks (T, B, streams), for unit process noise from a stationary start."""
+    coefficients, ratio = (each[..., None, :] for each in _model(point))
+    shape = (len(coefficients), *ratio.shape[:-2], *blocks.shape[1:])
+    covariance = np.broadcast_to(_stationary(coefficients), (shape[0], *shape)).copy()
+    return _errors(blocks, (coefficients, 1.0, ratio), np.zeros(shape), covariance)
+
+
 def _likelihood(blocks: NDArray, point: NDArray) -> tuple[NDArray, NDArray]:
     """Minus twice the log likelihood, with the variance of the process that maximises it.
 
     Shapes: blocks (BLOCK, B, streams), point (d, …, streams).
     """
-    coefficients, ratio = (each[..., None, :] for each in _model(point))
-    shape = (*ratio.shape[:-2], *blocks.shape[1:])
-    covariance = np.broadcast_to(
-        _stationary(coefficients), (len(coefficients), len(coefficients), *shape)
-    ).copy()
-    logs, squares, count = np.zeros(shape), np.zeros(shape), np.zeros(blocks.shape[1:])
-    mean = np.zeros((len(coefficients), *shape))
-    filtered = _errors(blocks, coefficients, 1.0, ratio, mean, covariance)
-    for value, (error, variance) in zip(blocks, filtered, strict=True):
+    logs, squares = np.zeros((2, *point.shape[1:-1], *blocks.shape[1:]))
+    count = np.zeros(blocks.shape[1:])
+    for value, (error, variance) in zip(blocks, _errors_at(point, blocks), strict=True):
         seen = ~np.isnan(value)
         logs += np.where(seen, np.log(variance), 0.0)
         squares += np.where(seen, error**2 / variance, 0.0)
@@ -366,9 +362,6 @@ def _partial(blocks: NDArray, order: int) -> NDArray:
 
 def _standardised(values: NDArray, point: NDArray, scale: NDArray) -> NDArray:
     """Errors of values (T, streams) in standard deviations, and those, for a process variance."""
-    coefficients, ratio = _model(point)
-    filtered = _errors(
-        values, coefficients, 1.0, ratio, np.zeros_like(coefficients), _stationary(coefficients)
-    )
-    both = [(error, np.sqrt(variance * scale)) for error, variance in filtered]
+    filtered = _errors_at(point, values[:, None])
+    both = [(error[0], np.sqrt(variance[0] * scale)) for error, variance in filtered]
     return np.array([(error / each, each) for error, each in both]).swapaxes(0, 1)

@@ -195,14 +195,3 @@ def finite_state(online: OnlineFilter, state: FilterState) -> FilterState:
 def by_stream(values: NDArray) -> NDArray:
     """(n * d_y, T) of (n, T, d_y)."""
     return np.moveaxis(values, 2, 1).reshape(-1, values.shape[1])
-
-
-def by_output(values: NDArray, count: int) -> NDArray:
-    """(d_y, n * T) of (n * d_y, T)."""
-    parted = values.reshape(count, -1, values.shape[1])
-    return np.moveaxis(parted, 1, 0).reshape(parted.shape[1], -1)
-
-
-def by_machine(values: NDArray, count: int) -> NDArray:
-    """(n, T, d_y) of (d_y, n * T)."""
-    return np.moveaxis(values.reshape(len(values), count, -1), 0, 2)

@@ -67,7 +67,7 @@ class ConformalScores:
 
         Parameters
         ----------
-        errors : array (streams,) or (streams, T)
+        errors : array (streams, ...)
             Errors like those of the calibration; infinite ones are large.
         width : float or array like errors
             Widths of their rounding intervals: see `fit_scores`.
@@ -75,7 +75,7 @@ class ConformalScores:
         """
         given = np.asarray(errors, dtype=float)
         require(
-            given.ndim in (1, 2) and len(given) == len(self.independent),
+            given.ndim and len(given) == len(self.independent),
             "errors",
             expected=f"errors of {len(self.independent)} streams",
             got=f"shape {given.shape}",

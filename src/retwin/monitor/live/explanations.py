@@ -19,13 +19,13 @@ from retwin.monitor.live.live import Live
 from retwin.monitor.models.cause import (
     BEFORE,
     EVENT,
+    CauseSearch,
     cause_data,
-    find_cause,
     is_due,
     possible_causes,
 )
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.watched import Alarm
+from retwin.monitor.models.state import Alarm
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.gridded import gridded, record_of
 from retwin.monitor.store.samples import SECOND
@@ -71,7 +71,7 @@ class Explanations:
 
     Machines take turns, and of each machine the newest event is explained first. A context manager
     that ends the thread. What is found is an entry `cause` of the log; of further alarms of an
-    event, where one is due (`is_due`), it tells whether the fault is the `same`, see `find_cause`.
+    event, where one is due (`is_due`), it tells whether the fault is the `same`, see `CauseSearch`.
     Alarms that lack theirs, since the program was stopped, are explained when it is started again.
 
     Parameters
@@ -207,9 +207,8 @@ class Explanations:
         record, first = record_of(monitor.twin, values), int(times[0])
         *earlier, newest = [_alarm(each.data, first, period) for each in entries]
         alarms = [*earlier, replace(newest, sample=record.steps - 1)]
-        has, causes = self._current.get((name, _event(last)), ("", 0.0)), self.causes(twin, monitor)
-        given = monitor.twin, record, alarms, causes
-        cause = find_cause(*given, current=has, known_start=False)
+        search = CauseSearch(monitor.twin, record, self.causes(twin, monitor), known_start=False)
+        cause = search.find(alarms, self._current.get((name, _event(last)), ("", 0.0)))
         ends = cause.size, cause.onset
         size, onset = ([each if np.isfinite(each) else None for each in end] for end in ends)
         moments = [None if each is None else first + round(each * SECOND) for each in onset]

@@ -19,7 +19,7 @@ from retwin.monitor.live.stream_machine import StreamMachine, Work, step
 from retwin.monitor.live.trajectory_machine import TrajectoryMachine
 from retwin.monitor.models.kinds import AnyMonitor, load_monitor
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.monitor_state import Layout
+from retwin.monitor.models.state import Layout
 from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.gridded import Limits
@@ -253,8 +253,8 @@ class Live:
                 with self._using(given.asset):
                     if self._machines.get(given.asset) is not machine:
                         continue  # another version watches since
-                    if made.watched is None:
-                        machine.refuse(int(made.samples.times[0]), made.refused)
+                    if isinstance(made, str):
+                        machine.refuse(given.begin, made)
                         return self._counted(machine, "refused")
                     return self._counted(machine, "used", machine.take(made))
 

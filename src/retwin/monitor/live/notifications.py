@@ -13,6 +13,7 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime, time
 from pathlib import Path
@@ -21,10 +22,11 @@ from typing import Protocol
 from retwin.checks import needs_extra, require
 from retwin.errors import brief
 from retwin.monitor.models.cause import cause_text
+from retwin.monitor.settings import NotifySettings, secret
 from retwin.monitor.store.audit import Entry
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.store.store import Store
-from retwin.serialisation.files import refusing, write_atomically
+from retwin.serialisation.files import read_json, refusing, write_json
 
 FIRST, LONGEST = 1.0, 300.0
 """Seconds after which a message that failed is sent again at first, and at most."""
@@ -115,6 +117,14 @@ class Receiver:
     assets: Sequence[str] = ()
     quiet: Sequence[tuple[time, time]] = ()
 
+    @classmethod
+    def of(cls, name: str, settings: NotifySettings) -> Receiver:
+        """Who is notified, as the settings state it."""
+        address = secret("address", settings.url_env)
+        channel = AppriseChannel(address) if address else FileChannel(settings.file)  # type: ignore[arg-type]
+        quiet = [tuple(map(time.fromisoformat, each.split("-"))) for each in settings.quiet]
+        return cls(name, channel, settings.kinds, settings.assets, quiet)  # type: ignore[arg-type]
+
     def hears(self, entry: Entry) -> bool:
         """Whether it is sent this entry."""
         return entry.kind in self.kinds and (
@@ -156,12 +166,9 @@ class Notifications:
         for each in receivers:
             self._sent.setdefault(each.name, last.sequence if last else -1)
         self._write()
-        self._threads = [
-            threading.Thread(target=self._run, args=(each,), name=f"notify {each.name}")
-            for each in receivers
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._threads = ThreadPoolExecutor(max(1, len(receivers)), "notify")
+        for each in receivers:
+            self._threads.submit(self._run, each)
 
     def __enter__(self) -> Notifications:
         return self
@@ -172,8 +179,7 @@ class Notifications:
     def close(self) -> None:
         """Send what is new, and end the threads; what fails is sent after the next start."""
         self._stop.set()
-        for thread in self._threads:
-            thread.join()
+        self._threads.shutdown()
 
     def _run(self, receiver: Receiver) -> None:
         wait, failed, last = FIRST, False, False
@@ -200,8 +206,8 @@ class Notifications:
             self._write()
 
     def _write(self) -> None:
-        with self._lock, write_atomically(self._file) as part:
-            part.write_text(json.dumps(self._sent), encoding="utf-8")
+        with self._lock:
+            write_json(self._file, self._sent)
 
 
 def _read(file: Path) -> dict[str, int]:
@@ -210,8 +216,7 @@ def _read(file: Path) -> dict[str, int]:
         return {}
     expected = "a file that says which entries were sent"
     with refusing(file, expected=expected, remedy="remove it: then only new entries are sent"):
-        sent = json.loads(file.read_bytes())
-        return {str(name): int(sequence) for name, sequence in sent.items()}
+        return {str(name): int(sequence) for name, sequence in read_json(file).items()}
 
 
 REMEDY = (

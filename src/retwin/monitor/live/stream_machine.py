@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from retwin.monitor.live.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.monitor_state import Layout
-from retwin.monitor.models.watched import Watched
+from retwin.monitor.models.state import Layout, Watched
 from retwin.monitor.store.gridded import Limits
 from retwin.monitor.store.samples import EARLIEST, SECOND, Asset, Samples, Update
 
@@ -83,7 +82,8 @@ class StreamMachine(Machine[Monitor]):
         self._rows: list[NDArray] = []
         self._work: deque[Work] = deque()
         self._begins = True
-        self._state = layout.start
+        self.state = layout.start
+        """That of the monitor after the samples that were stepped, as a row of the layout."""
         self._new: dict[int, NDArray] = {}
         self._window = [0, 0, 0]
         self._wrong = [0, 0, 0]
@@ -166,16 +166,12 @@ class StreamMachine(Machine[Monitor]):
         """The next complete samples, which must be stepped before any others; None if none are."""
         return self._work.popleft() if self._work else None
 
-    def state_for(self, work: Work) -> NDArray:
-        """The monitor's state before these samples, as a row of the layout."""
-        return self.layout.start if work.begins else self._state
-
     def stepped(self, work: Work, state: NDArray, watched: Watched, row: int) -> None:
         """Take the state after these samples, and what was found in them, a row of `watched`."""
         name = self.asset.name
         alarms = [each for each in watched.alarms if each.trajectory == name]
         endings = [each for each in watched.endings if each.trajectory == name]
-        self._state, self.changed = state, True
+        self.state, self.changed = state, True
         self.evidence = float(watched.evidence[row, -1])
         self.outside = bool(watched.outside[row])
         places = work.first + np.arange(len(work.values))
@@ -227,7 +223,7 @@ class StreamMachine(Machine[Monitor]):
         own = (self._origin, self._done, self.newest, self.asset.version, *self._window)
         return {
             "stream": np.array(own, dtype=np.int64),
-            "monitor": self._state,
+            "monitor": self.state,
             "status": np.array([self.evidence, *self._wrong, *self._doubtful], dtype=float),
             "digest": self.layout.digest,
         }
@@ -239,11 +235,11 @@ class StreamMachine(Machine[Monitor]):
         origin, done, self.newest, version, *window = arrays["stream"].tolist()
         other = not np.array_equal(arrays.get("digest", self.layout.digest), self.layout.digest)
         shape = arrays["monitor"].shape
-        if version != self.asset.version or other or shape != self._state.shape:
+        if version != self.asset.version or other or shape != self.state.shape:
             return False  # it begins anew
         self._origin, self._done, self._farthest, self._window = origin, done, done, window
-        self._state, self._begins = arrays["monitor"], False
-        before = self.layout.state(self._state[None])
+        self.state, self._begins = arrays["monitor"], False
+        before = self.layout.state(self.state[None])
         self.void, self.event = bool(before.void[0]), bool(before.course.event[0] >= 0)
         self.evidence, *more = arrays["status"].tolist()
         self._wrong = [int(each) for each in more[:3]]
@@ -364,7 +360,8 @@ def step(together: Sequence[tuple[StreamMachine, Work]]) -> dict[str, int]:
     machines = [each for each, _ in together]
     monitor = machines[0].monitor
     layout = machines[0].layout
-    before = layout.state(np.stack([machine.state_for(work) for machine, work in together]))
+    known = [layout.start if work.begins else machine.state for machine, work in together]
+    before = layout.state(np.stack(known))
     values = np.stack([work.values for _, work in together])
     commands, measured = np.split(values, [len(monitor.twin.inputs)], axis=2)
     names = [each.asset.name for each in machines]

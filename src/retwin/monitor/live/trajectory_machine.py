@@ -31,13 +31,12 @@ REMEMBERED = 1000
 @dataclass(frozen=True, eq=False)
 class Diagnosed:
     """What a trajectory changes, before it is stored: its samples, the state after it, and what was
-    found in it; or only why it was refused.
+    found in it.
     """
 
     samples: Samples
     state: TrajectoryState
-    watched: WatchedTrajectories | None
-    refused: str = ""
+    watched: WatchedTrajectories
 
 
 class TrajectoryMachine(Machine[TrajectoryMonitor]):
@@ -93,20 +92,21 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         """Log why a trajectory is not used."""
         self.log("event", moment, what="trajectory", text=f"trajectory not used: {why}")
 
-    def diagnose(self, given: Trajectory) -> Diagnosed:
-        """What a trajectory changes; nothing is changed yet, so that no lock is needed."""
+    def diagnose(self, given: Trajectory) -> Diagnosed | str:
+        """What a trajectory changes, or why it cannot be used.
+
+        Nothing is changed yet, so that no lock is needed.
+        """
         samples = given.samples(self.monitor.twin.rate)
         try:
             record = record_of(self.monitor.twin, given.values)
             return Diagnosed(samples, *self.monitor.watch(record, self._state))
         except Exception as error:  # Whatever fails, the next trajectory is diagnosed.
-            why = str(error) if isinstance(error, InputError) else f"not diagnosed: {brief(error)}"
-            return Diagnosed(samples, self._state, None, why)
+            return str(error) if isinstance(error, InputError) else f"not diagnosed: {brief(error)}"
 
     def take(self, found: Diagnosed) -> int:
         """Continue after a diagnosed trajectory; the number of its alarms."""
         watched, samples = found.watched, found.samples
-        assert watched is not None
         last = int(samples.times[-1])
         for alarm in watched.alarms:  # with its cause, which is known at once
             shares = alarm.probability, alarm.shares.get(UNKNOWN, 0.0), alarm.shares

@@ -15,7 +15,7 @@ from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.inversion.fault_evidence import FaultEvidence
 from retwin.diagnosis.inversion.states import StateInversionDiagnoser
-from retwin.monitor.models.watched import Alarm
+from retwin.monitor.models.state import Alarm
 from retwin.progress import Progress, tracked
 from retwin.twins.faults.actuator_faults import Fault, ends_of
 from retwin.twins.faults.system_faults import (
@@ -90,6 +90,11 @@ class Cause:
     same: bool = False
     unit: str = ""
     limit: bool = False
+
+    @property
+    def likely(self) -> bool:
+        """Whether its class, and nothing besides, is more probable than all else."""
+        return self.probability * (1 - self.unknown) > PROBABLE
 
 
 def cause_text(cause: Mapping[str, Any], since: str) -> str:
@@ -278,9 +283,7 @@ def find_causes(
         if is_due([each.sample for each in known if each.event == alarm.event], alarm.sample):
             known.append(alarm)
             own, has = record[[ids.index(alarm.trajectory)]], current.get(event, ("", 0.0))
-            cause = find_cause(
-                twin, own, known, faults, before, current=has, known_start=known_start
-            )
+            cause = CauseSearch(twin, own, faults, before, known_start).find(known, has)
             latest[event] = cause
             if not cause.same or cause.name == has[0]:
                 current[event] = cause.name, cause.unknown
@@ -309,96 +312,146 @@ def is_due(inferred: Sequence[int], sample: int) -> bool:
     return sample - inferred[-1] > max(MIN_WINDOW, GROWTH * (inferred[-1] - inferred[0]))
 
 
-def find_cause(
-    twin: DynamicsTwin,
-    record: Trajectories,
-    alarms: Sequence[Alarm],
-    faults: Mapping[str, Fault | None],
-    before: int = BEFORE,
-    *,
-    current: tuple[str, float] = ("", 0.0),
-    known_start: bool = True,
-) -> Cause:
-    """The cause of the last of a trajectory's alarms, see `find_causes`.
+@dataclass(frozen=True, eq=False)
+class CauseSearch:
+    """A search for the causes of alarms in a record of one trajectory.
 
-    A further alarm of an event is of the `same` fault unless another class is probable, for all of
-    the event or else for what came last, and explains it better: in place of the first fault, or
-    after it. That one alone may last or have ended.
-
-    Parameters
-    ----------
-    alarms : sequence of Alarm
-        The newest one before the event, if any, and those of the event at which its cause is
-        inferred.
-    current : tuple of str and float
-        The cause that the event has, "" for none, and the probability that there was something
-        besides. It is also that of a cause which explains the newest samples alone: in few of them
-        each cause seems to.
-
+    Its attributes are the parameters of `find_causes`.
     """
-    alarm, own = alarms[-1], [each for each in alarms if each.event == alarms[-1].event]
-    opening = own[0].sample
-    first = opening - before
-    if len(own) < len(alarms):
-        first = max(first, min(alarms[0].sample + 1, opening - MIN_WINDOW))
 
-    def infer(begin: int) -> Cause:
-        return _infer(twin, record, begin, alarm, faults, known_start and begin == 0)
+    twin: DynamicsTwin
+    record: Trajectories
+    faults: Mapping[str, Fault | None]
+    before: int = BEFORE
+    known_start: bool = True
 
-    def likely(cause: Cause) -> bool:
-        return cause.probability * (1 - cause.unknown) > PROBABLE
+    def find(self, alarms: Sequence[Alarm], current: tuple[str, float] = ("", 0.0)) -> Cause:
+        """The cause of the last of the trajectory's alarms.
 
-    start = max(0, first)
-    if len(own) == 1:
-        return infer(start)
-    whole = infer(start) if alarm.sample - opening <= before else None
-    begin = max(0, own[-2].sample + 1, alarm.sample - before)
-    cause = whole if whole is not None and likely(whole) else infer(begin)
-    same = cause.name in (current[0], HEALTHY) or not likely(cause)
-    known = faults.get(current[0])
-    if not same and isinstance(known, TimedFault):
-        both = known, faults[cause.name]
-        window = max(start, alarm.sample - EVENT), begin, alarm
-        same = not _better(twin, record, window, both, np.log(alarm.evidence), whole is not None)
-    if whole is not None and same:
-        cause = whole
-    elif cause is not whole:
-        cause = replace(cause, unknown=max(cause.unknown, current[1]))
-    return replace(cause, same=same)
+        A further alarm of an event is of the `same` fault unless another class is probable, for all
+        of the event or else for what came last, and explains it better: in place of the first
+        fault, or after it. That one alone may last or have ended.
 
+        Parameters
+        ----------
+        alarms : sequence of Alarm
+            The newest one before the event, if any, and those of the event at which its cause is
+            inferred.
+        current : tuple of str and float
+            The cause that the event has, "" for none, and the probability that there was something
+            besides. It is also that of a cause which explains the newest samples alone: in few of
+            them each cause seems to.
 
-def _infer(
-    twin: DynamicsTwin,
-    record: Trajectories,
-    first: int,
-    alarm: Alarm,
-    faults: Mapping[str, Fault | None],
-    known_start: bool,
-) -> Cause:
-    """The cause of an alarm from the samples since the first one."""
-    begin, latest = first / record.rate, (alarm.sample - first) / record.rate
-    lasting = {name: _lasting(fault, latest) for name, fault in faults.items()}
-    made = StateInversionDiagnoser(moved(twin, alarm.machine), lasting).diagnose(
-        _window(record, first, alarm.sample), known_start=known_start
-    )
-    best = int(made.probabilities[0].argmax())
+        """
+        alarm, own = alarms[-1], [each for each in alarms if each.event == alarms[-1].event]
+        opening, before = own[0].sample, self.before
+        start = max(0, opening - before)
+        if len(own) < len(alarms):
+            start = max(start, min(alarms[0].sample + 1, opening - MIN_WINDOW))
+        if len(own) == 1:
+            return self._infer(start, alarm)
+        whole = self._infer(start, alarm) if alarm.sample - opening <= before else None
+        begin = max(0, own[-2].sample + 1, alarm.sample - before)
+        cause = whole if whole is not None and whole.likely else self._infer(begin, alarm)
+        same = cause.name in (current[0], HEALTHY) or not cause.likely
+        known = self.faults.get(current[0])
+        if not same and isinstance(known, TimedFault):
+            both = known, self.faults[cause.name]
+            window = max(start, alarm.sample - EVENT), begin, alarm
+            same = not self._better(window, both, np.log(alarm.evidence), whole is not None)
+        if whole is not None and same:
+            cause = whole
+        elif cause is not whole:
+            cause = replace(cause, unknown=max(cause.unknown, current[1]))
+        return replace(cause, same=same)
 
-    def interval(estimate: Estimate) -> tuple[float, float, float]:
-        value, low, high = (getattr(estimate, part)[0, best] for part in ("value", "low", "high"))
-        return float(value), float(low), float(high)
+    def _infer(self, first: int, alarm: Alarm) -> Cause:
+        """The cause of an alarm from the samples since the first one."""
+        rate = self.record.rate
+        begin, latest = first / rate, (alarm.sample - first) / rate
+        lasting = {name: _lasting(fault, latest) for name, fault in self.faults.items()}
+        diagnoser = StateInversionDiagnoser(moved(self.twin, alarm.machine), lasting)
+        window, known_start = self._window(first, alarm.sample), self.known_start and first == 0
+        made = diagnoser.diagnose(window, known_start=known_start)
+        best = int(made.probabilities[0].argmax())
 
-    onset = interval(made.onset)
-    return Cause(
-        alarm,
-        made.classes[best],
-        float(made.probabilities[0, best]),
-        float(made.unknown[0]),
-        interval(made.size),
-        (begin + onset[0], begin + onset[1], begin + onset[2]),
-        dict(zip(made.classes, made.probabilities[0].tolist(), strict=True)),
-        unit=size_unit(faults[made.classes[best]], twin),
-        limit=_at_limit(faults[made.classes[best]], interval(made.size)),
-    )
+        def interval(estimate: Estimate, shift: float = 0.0) -> tuple[float, float, float]:
+            parts = (getattr(estimate, part)[0, best] for part in ("value", "low", "high"))
+            value, low, high = (shift + float(each) for each in parts)
+            return value, low, high
+
+        name, size = made.classes[best], interval(made.size)
+        return Cause(
+            alarm,
+            name,
+            float(made.probabilities[0, best]),
+            float(made.unknown[0]),
+            size,
+            interval(made.onset, begin),
+            dict(zip(made.classes, made.probabilities[0].tolist(), strict=True)),
+            unit=size_unit(self.faults[name], self.twin),
+            limit=_at_limit(self.faults[name], size),
+        )
+
+    def _better(
+        self,
+        window: tuple[int, int, Alarm],
+        faults: tuple[TimedFault, Fault | None],
+        penalty: float,
+        whole: bool,
+    ) -> bool:
+        """Whether another fault explains an event better than its cause alone.
+
+        Compared is the evidence in the same samples. The cause lasts or has ended, where it had its
+        most probable size and onset. The other fault is a second one in the samples before the
+        alarm, or is there in place of the cause. Where the second one begins the states may be
+        unknown again, and if there is none also the size of the first one.
+
+        Parameters
+        ----------
+        window : tuple of int, int and Alarm
+            The first sample that counts, the first of those with a second fault, and the alarm.
+        faults : tuple of TimedFault and Fault
+            The cause and the other one.
+        penalty : float
+            By which the evidence for two faults must be larger: as for an alarm.
+        whole : bool
+            Whether these are all samples of the event: only then the cause may be another one.
+
+        """
+        (first, begin, alarm), last, rate = window, window[2].sample, self.record.rate
+        if begin - first < MIN_WINDOW:
+            return whole
+        healthy = moved(self.twin, alarm.machine)
+
+        def evidence(begin: int, end: int, fault: Fault | None) -> tuple[float, NDArray]:
+            model = FaultEvidence.of(healthy, self._window(begin, end), known_start=False)
+            known = fault if isinstance(fault, TimedFault) else None
+            found = model.integral(known)
+            return model.tolerated(known, found).evidence, found.best
+
+        def lasts(begin: int, end: int, fault: Fault | None) -> Fault | None:
+            return _lasting(fault, (end - begin) / rate)
+
+        one, other = faults
+        until, (size, onset, _) = evidence(first, begin - 1, lasts(first, begin - 1, one))
+        onset, after = onset / rate, (last + 1 - first) / rate
+        point = replace(one, onset=onset, end=None)
+        if isinstance(point, SizedFault):
+            point = replace(point, size=float(size))
+        end = replace(point, end=(onset + 1 / rate, after))
+        alone = (
+            evidence(first, last, lasts(first, last, one))[0],
+            until + evidence(first, last, end)[0] - evidence(first, begin - 1, point)[0],
+            until + evidence(begin, last, replace(one, onset=0.0, end=None))[0],
+        )
+        more = [until + evidence(begin, last, lasts(begin, last, other))[0] - penalty]
+        if whole:
+            more.append(evidence(first, last, lasts(first, last, other))[0])
+        return bool(logsumexp(more) > logsumexp(alone))
+
+    def _window(self, first: int, last: int) -> Trajectories:
+        return self.record.between(first / self.record.rate, (last + 1) / self.record.rate)
 
 
 def _at_limit(fault: Fault | None, size: tuple[float, float, float]) -> bool:
@@ -411,69 +464,6 @@ def _at_limit(fault: Fault | None, size: tuple[float, float, float]) -> bool:
     return bool((reached & (np.abs(ends) > margin)).any())
 
 
-def _better(
-    twin: DynamicsTwin,
-    record: Trajectories,
-    window: tuple[int, int, Alarm],
-    faults: tuple[TimedFault, Fault | None],
-    penalty: float,
-    whole: bool,
-) -> bool:
-    """Whether another fault explains an event better than its cause alone.
-
-    Compared is the evidence in the same samples. The cause lasts or has ended, where it had its
-    most probable size and onset. The other fault is a second one in the samples before the alarm,
-    or is there in place of the cause. Where the second one begins the states may be unknown again,
-    and if there is none also the size of the first one.
-
-    Parameters
-    ----------
-    window : tuple of int, int and Alarm
-        The first sample that counts, the first of those with a second fault, and the alarm.
-    faults : tuple of TimedFault and Fault
-        The cause and the other one.
-    penalty : float
-        By which the evidence for two faults must be larger: as for an alarm.
-    whole : bool
-        Whether these are all samples of the event: only then the cause may be another one.
-
-    """
-    (first, begin, alarm), last = window, window[2].sample
-    if begin - first < MIN_WINDOW:
-        return whole
-    healthy = moved(twin, alarm.machine)
-
-    def evidence(begin: int, end: int, fault: Fault | None) -> tuple[float, NDArray]:
-        model = FaultEvidence.of(healthy, _window(record, begin, end), known_start=False)
-        known = fault if isinstance(fault, TimedFault) else None
-        found = model.integral(known)
-        return model.tolerated(known, found).evidence, found.best
-
-    def lasts(begin: int, end: int, fault: Fault | None) -> Fault | None:
-        return _lasting(fault, (end - begin) / record.rate)
-
-    one, other = faults
-    until, (size, onset, _) = evidence(first, begin - 1, lasts(first, begin - 1, one))
-    onset, after = onset / record.rate, (last + 1 - first) / record.rate
-    point = replace(one, onset=onset, end=None)
-    if isinstance(point, SizedFault):
-        point = replace(point, size=float(size))
-    end = replace(point, end=(onset + 1 / record.rate, after))
-    alone = (
-        evidence(first, last, lasts(first, last, one))[0],
-        until + evidence(first, last, end)[0] - evidence(first, begin - 1, point)[0],
-        until + evidence(begin, last, replace(one, onset=0.0, end=None))[0],
-    )
-    more = [until + evidence(begin, last, lasts(begin, last, other))[0] - penalty]
-    if whole:
-        more.append(evidence(first, last, lasts(first, last, other))[0])
-    return bool(logsumexp(more) > logsumexp(alone))
-
-
 def _lasting(fault: Fault | None, latest: float) -> Fault | None:
     """A fault that begins at any time until `latest` in s, and lasts."""
     return replace(fault, onset=(0.0, latest), end=None) if isinstance(fault, TimedFault) else fault
-
-
-def _window(record: Trajectories, first: int, last: int) -> Trajectories:
-    return record.between(first / record.rate, (last + 1) / record.rate)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,13 +103,13 @@ def fit_monitor(
     for note in summarise(check_records(healthy).findings):
         warnings.warn(f"healthy: {note}", stacklevel=2)
     twin = with_main_directions(twin, healthy.commands.astype(float))
-    measured = np.where(healthy.mask, healthy.observed, np.nan).astype(float)
+    measured = healthy.measured.astype(float)
     steps = resolution(np.moveaxis(measured, 2, 0).reshape(measured.shape[2], -1))
     expected = "records with which the filter of the twin stays finite"
     remedy = "leave them out, or give the twin more substeps"
-    first = _calibrated(twin, Predictor(), healthy, measured, steps)
-    first = given("healthy", first, expected, got="others", remedy=remedy)
-    found = [first, *_slower(twin, healthy, measured, steps)]
+    calibrated = partial(_calibrated, twin, healthy, measured, steps)
+    first = given("healthy", calibrated(Predictor()), expected, got="others", remedy=remedy)
+    found = [first, *_slower(twin, healthy.steps, calibrated)]
     error, width = (_joined([getattr(each, of) for each in found]) for of in ("error", "width"))
     names, folds = _folds(healthy, np.isfinite(error).all(axis=0))
     disturbance = fit_disturbance(error, folds=folds)
@@ -146,14 +147,14 @@ class _Calibrated:
 
 
 def _slower(
-    twin: DynamicsTwin, healthy: Trajectories, measured: NDArray, steps: NDArray
+    twin: DynamicsTwin, samples: int, calibrated: Callable[[Predictor], _Calibrated | None]
 ) -> list[_Calibrated]:
     """The model that follows slowly, where it is another one and settles within the records."""
     if not (twin.process.any() or twin.proportional.any()):
         return []
     for factor in SLOWER:
-        found = _calibrated(twin, Predictor(factor), healthy, measured, steps)
-        if found is None or found.predictor.warm_up * twin.rate >= healthy.steps // 2:
+        found = calibrated(Predictor(factor))
+        if found is None or found.predictor.warm_up * twin.rate >= samples // 2:
             continue
         if np.nanmean(found.error**2) <= LARGEST_VARIANCE:
             return [found]
@@ -161,16 +162,12 @@ def _slower(
 
 
 def _calibrated(
-    twin: DynamicsTwin,
-    predictor: Predictor,
-    healthy: Trajectories,
-    measured: NDArray,
-    steps: NDArray,
+    twin: DynamicsTwin, healthy: Trajectories, measured: NDArray, steps: NDArray, model: Predictor
 ) -> _Calibrated | None:
     """A model with the effect of the record that fits best; None if it does not stay finite."""
     given, best, found = (healthy.commands.astype(float), measured, healthy.mask), -np.inf, None
     for effect in EFFECTS:
-        online = replace(predictor, effect=effect).filter(twin)
+        online = replace(model, effect=effect).filter(twin)
         _, mean, covariance = online.step(online.start(len(healthy)), *given)
         if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
             continue
@@ -180,13 +177,13 @@ def _calibrated(
     if found is None:
         return None
     effect, online, mean, covariance = found
-    warm_up = settled(predictor.filter(twin), len(healthy), given)
+    warm_up = settled(model.filter(twin), len(healthy), given)
     counted = (np.arange(healthy.steps) >= warm_up)[None, :, None]
     errors = standardised(measured - mean, covariance, healthy.mask & counted, steps)
     count, d_u = len(healthy), healthy.commands.shape[2]
     before = np.zeros((count, len(DECAYS), d_u)), np.full((count, d_u), np.nan)
     noted = features(*before, given[0], mean, span_of(twin))[1]
-    known = replace(predictor, warm_up=warm_up / twin.rate, effect=effect)
+    known = replace(model, warm_up=warm_up / twin.rate, effect=effect)
     return _Calibrated(known, *errors, noted)
 
 

@@ -18,8 +18,6 @@ from retwin.monitor.detect.events import CHANGED, FOLLOWS, Course, Rules
 from retwin.monitor.detect.noise import DECAYS, Noise, features, own_scale
 from retwin.monitor.detect.predictors import (
     Predictor,
-    by_machine,
-    by_output,
     by_stream,
     finite_state,
     implausible,
@@ -30,9 +28,8 @@ from retwin.monitor.detect.promise import Promise, Tried
 from retwin.monitor.detect.scores import ConformalScores, middle
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.detect.validity import Validity
-from retwin.monitor.models.monitor_state import MonitorState
 from retwin.monitor.models.saved import DISTURBANCE, read_fields, write_fields
-from retwin.monitor.models.watched import Alarm, Ending, Part, Visible, Watched
+from retwin.monitor.models.state import Alarm, Ending, MonitorState, Part, Visible, Watched
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.filter.online import OnlineFilter
 from retwin.update.dynamics.twin import BEYOND, DynamicsTwin
@@ -106,17 +103,9 @@ class Monitor:
     @property
     def promises(self) -> dict[str, Promise]:
         """What is promised of each output."""
-        outputs = self.twin.outputs.names
-        return {
-            name: Promise(
-                self.run_length,
-                self.twin.rate,
-                self.slack[i],
-                self.alpha,
-                self.slack[i + len(outputs) :: len(outputs)],
-            )
-            for i, name in enumerate(outputs)
-        }
+        names, about = self.twin.outputs.names, (self.run_length, self.twin.rate)
+        classes = {name: self.slack[i :: len(names)] for i, name in enumerate(names)}
+        return {name: Promise(*about, own[0], self.alpha, own[1:]) for name, own in classes.items()}
 
     @property
     def run_length(self) -> float:
@@ -201,8 +190,8 @@ class Monitor:
 
         """
         check_channels(self.twin, record, "record")
-        measured = np.where(record.mask, record.observed, np.nan)
-        return self.step(self.start(len(record)), record.commands, measured, record.ids)[1]
+        start = self.start(len(record))
+        return self.step(start, record.commands, record.measured, record.ids)[1]
 
     @property
     def rules(self) -> Rules:
@@ -231,8 +220,9 @@ class Monitor:
         sums = np.where(calm[:, None], sums, state.scale)
         own = np.where(calm[:, None], own, own[:, :1])
         error, width = error / own, width / own
-        low, high = self.scores.score(by_output(error, count), by_output(width, count))
-        low, high = (by_stream(by_machine(each, count)) for each in (low, high))
+        by_machine = (each.reshape(count, len(self.slack), -1) for each in (error, width))
+        scored = self.scores.score(*(np.swapaxes(each, 0, 1) for each in by_machine))
+        low, high = (by_stream(np.moveaxis(each, 0, 2)) for each in scored)
         since, rate = state.course.samples - state.course.begun, self.twin.rate
         used = np.stack([each.used(since, samples, rate) for each in self.predictors], axis=1)
         used = np.repeat(used, len(self.twin.outputs), axis=1).reshape(low.shape)
@@ -333,14 +323,10 @@ class Monitor:
         rows, first = np.flatnonzero(anew), model.start()
         filters = []
         for online, own in zip(self._filters, state.filters, strict=True):
-            new, old = online.start(len(rows)), own.of(rows)
-            kept = {name: getattr(old, name) for name in ("commands", "simulated")}
-            learned = ~changed[rows]
-            for name in ("centre", "root"):
-                values = getattr(new, name)
-                values[learned] = getattr(old, name)[learned]
-                kept[name] = values
-            filters.append(own.merged(rows, replace(new, **kept)))
+            old, same = own.of(rows), np.flatnonzero(~changed[rows])
+            new = replace(online.start(len(rows)), commands=old.commands, simulated=old.simulated)
+            learned = replace(new, centre=old.centre, root=old.root).of(same)
+            filters.append(own.merged(rows, new.merged(same, learned)))
         where = np.repeat(anew, each)
         scale = np.where(np.repeat(changed, each)[:, None], 0.0, state.scale)
         disturbance = DisturbanceState(
@@ -392,7 +378,7 @@ class Monitor:
             high = np.maximum(high, self.twin.forecast.high[-count:])
         found = {}
         for i, name in enumerate(self.twin.outputs.names):
-            own = np.where(record.mask[..., i], record.observed[..., i], np.nan)
+            own = record.measured[..., i]
             excess = range_excess(own[..., None], low[[i]], high[[i]])
             row, furthest = np.unravel_index(np.argmax(excess), excess.shape)
             if excess[row, furthest] > FAR:

@@ -16,7 +16,7 @@ from retwin.monitor.detect.predictors import Predictor
 from retwin.monitor.detect.promise import Tried
 from retwin.monitor.detect.scores import ConformalScores
 from retwin.monitor.detect.slack import Slack
-from retwin.monitor.models.watched import Visible
+from retwin.monitor.models.state import Visible, arrays_of, part_of
 from retwin.serialisation.models import check_weights, read_model, refusing, write_model
 from retwin.update.dynamics.twin import DynamicsTwin
 
@@ -26,8 +26,6 @@ NUMBERS = ("arl", "lasting", "alpha")
 """Attributes of a monitor that are saved as numbers."""
 DISTURBANCE = ("coefficients", "mean", "process", "measurement")
 """Attributes of the disturbance that are saved as arrays."""
-NOISE = ("low", "high", "mean", "scale", "degrees")
-"""The same of the noise."""
 
 
 def write_fields(folder: str | Path, fields: Mapping[str, Any]) -> None:
@@ -42,8 +40,9 @@ def write_fields(folder: str | Path, fields: Mapping[str, Any]) -> None:
         **{name: fields[name] for name in NUMBERS},
     }
     arrays = {name: getattr(fields["disturbance"], name) for name in DISTURBANCE}
-    arrays |= {f"noise.{name}": getattr(fields["noise"], name) for name in NOISE}
-    arrays |= scores.arrays() | {"resolution": fields["resolution"]}
+    arrays |= (
+        arrays_of("noise", fields["noise"]) | scores.arrays() | {"resolution": fields["resolution"]}
+    )
     tensors = {name: torch.tensor(np.ascontiguousarray(each)) for name, each in arrays.items()}
     with write_model(folder, KIND, about, tensors) as temporary:
         fields["twin"].save(temporary / "twin")
@@ -57,7 +56,7 @@ def read_fields(folder: str | Path) -> dict[str, Any]:
         nothing = np.zeros((len(arrays["mean"]), 0))
         own = {name: arrays[name] for name in DISTURBANCE}
         disturbance = Disturbance(**own, held_out=nothing, deviation=nothing)
-        noise = Noise(**{name: arrays[f"noise.{name}"] for name in NOISE})
+        noise = part_of(Noise, "noise", arrays)
         scores = ConformalScores.of_arrays(arrays, about["copies"])
         slack = tuple(Slack(*each) for each in about["slack"])
         twin = DynamicsTwin.load(Path(folder) / "twin")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.models.cause import output_ranges, size_unit
 from retwin.monitor.models.monitor import Monitor
-from retwin.monitor.models.watched import SHARE, Visible
+from retwin.monitor.models.state import SHARE, Visible
 from retwin.progress import Progress, tracked
 from retwin.twins.collected import SimulationError
 from retwin.twins.faults.actuator_faults import Fault, Stuck
@@ -118,19 +118,19 @@ def _value_behind(fault: Fault | None, twin: DynamicsTwin) -> float | None:
 
 @dataclass(frozen=True)
 class _Windows:
-    """Parts of healthy records: of which one each is, and its first sample."""
+    """Parts of healthy records: the records that they are in, and their first samples."""
 
-    healthy: Trajectories
-    record: NDArray
+    commands: NDArray
+    observed: NDArray
+    mask: NDArray
     first: NDArray
     lead: int
     steps: int
 
-    def cut(self, values: NDArray, *, by_record: bool = True) -> NDArray:
-        """The parts (n, steps, ...) of values of each record, or of each window."""
-        rows = self.record if by_record else range(len(self.first))
-        pairs = zip(rows, self.first, strict=True)
-        return np.stack([values[row, first : first + self.steps] for row, first in pairs])
+    def cut(self, values: NDArray) -> NDArray:
+        """The parts (n, steps, ...) of values of their records."""
+        pairs = zip(values, self.first, strict=True)
+        return np.stack([record[first : first + self.steps] for record, first in pairs])
 
 
 def _windows(monitor: Monitor, healthy: Trajectories) -> _Windows:
@@ -147,7 +147,9 @@ def _windows(monitor: Monitor, healthy: Trajectories) -> _Windows:
     ]
     even = np.linspace(0, len(starts) - 1, min(ONSETS, len(starts)))
     chosen = np.array(starts)[even.round().astype(int)]
-    return _Windows(healthy, chosen[:, 0], chosen[:, 1], lead, steps)
+    rows, first = chosen.T
+    observed, mask = healthy.observed[rows], healthy.mask[rows]
+    return _Windows(healthy.commands[rows], observed, mask, first, lead, steps)
 
 
 def _share(
@@ -160,11 +162,9 @@ def _share(
     changed: dict[str, Any] = ({} if size is None else {"size": size}) | (
         {"end": None} if isinstance(fault, TimedFault) else {}
     )
-    rate, healthy = windows.healthy.rate, windows.healthy
-    faults = [
-        replace(fault, onset=(first + windows.lead) / rate, **changed) for first in windows.first
-    ]
-    observed, commands = healthy.observed[windows.record], healthy.commands[windows.record]
+    rate, observed = monitor.twin.rate, windows.observed
+    onsets = (windows.first + windows.lead) / rate
+    faults = [replace(fault, onset=onset, **changed) for onset in onsets.tolist()]
     if isinstance(fault, SensorError | SensorFreeze):
         observed = measured_with(observed, faults, rate)
     else:
@@ -172,17 +172,16 @@ def _share(
             warnings.simplefilter("ignore")
             try:
                 faulty, calm = (
-                    monitor.twin.simulate(commands, faults=each, seed=0).observed
+                    monitor.twin.simulate(windows.commands, faults=each, seed=0).observed
                     for each in (faults, None)
                 )
             except SimulationError:
                 return np.nan
         observed = observed + (faulty - calm)
-    seen = windows.cut(healthy.mask)
-    measured = np.where(seen, windows.cut(observed, by_record=False), np.nan)
+    measured = windows.cut(np.where(windows.mask, observed, np.nan))
     # Only the first alarm counts: one that never alarms does not begin anew after each of them.
     silent = replace(monitor, arl=sys.float_info.max)
-    state, known = silent.start(len(measured)), windows.cut(healthy.commands)
+    state, known = silent.start(len(measured)), windows.cut(windows.commands)
     alarm = monitor.rules.alarms(silent.step(state, known, measured)[1].evidence)
     quiet = np.flatnonzero(~alarm[:, : windows.lead].any(axis=1))
     return float(alarm[quiet, windows.lead :].any(axis=1).mean()) if len(quiet) else np.nan

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import threading
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping
 from dataclasses import asdict
 from importlib import resources
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Any, Literal
 
+import fastapi
 from pydantic import BaseModel, ConfigDict, Field
-from pydantic_core import to_jsonable_python
 from starlette.exceptions import HTTPException
 
 from retwin._version import __version__
-from retwin.checks import at_most, needs_extra
+from retwin.checks import at_most
 from retwin.errors import InputError
 from retwin.monitor.live.explanations import Explanations
 from retwin.monitor.live.gate import Gate
@@ -25,17 +24,11 @@ from retwin.monitor.live.live import Live
 from retwin.monitor.live.machine import Received
 from retwin.monitor.server.guard import RequestGuard
 from retwin.monitor.server.metrics import Metrics
-from retwin.monitor.server.views import Views
+from retwin.monitor.server.views import JSON, Number, Sequence, Views
 from retwin.monitor.store.samples import parse
 from retwin.monitor.versions.comparison import Comparisons
-from retwin.monitor.versions.decision import Decision
 from retwin.monitor.versions.registry import Registry
 from retwin.report.figures.style import CHROME, PALETTE
-
-if TYPE_CHECKING:
-    import fastapi
-else:
-    fastapi = needs_extra("fastapi", "monitor", "answers requests")
 
 MIN_TOKEN_LENGTH = 16
 """Characters of a token at least."""
@@ -51,17 +44,6 @@ FILES = {
     "/uplot.css": ("uplot.css", f"text/css; {TEXT}"),
 }
 """The files of the page and their types; the style sheet is made from the report's colours."""
-
-Sequence = Annotated[int, fastapi.Path(ge=0, lt=2**63)]
-Number = Annotated[int, fastapi.Path(ge=1, lt=2**31)]
-
-
-class JSON(fastapi.responses.JSONResponse):
-    """An answer in ASCII, with null for numbers that JSON does not have."""
-
-    def render(self, content: Any) -> bytes:
-        """The bytes of the answer; texts may contain halves of surrogate pairs."""
-        return json.dumps(to_jsonable_python(content, inf_nan_mode="null")).encode()
 
 
 class Acknowledgement(BaseModel):
@@ -133,8 +115,9 @@ def create_app(
     )
     _report_errors(app)
     _add_page(app)
-    views, metrics = Views(live, explanations), Metrics(live, sources or {})
-    _add_reading(app, live, views, metrics, emulated=emulated)
+    views = Views(live, explanations, emulated=emulated)
+    metrics = Metrics(live, sources or {})
+    _add_reading(app, live, views, metrics)
     _add_writing(app, live, gate, metrics)
     _add_versions(app, live, views)
     guard = RequestGuard(app, token, hosts)
@@ -145,21 +128,20 @@ def create_app(
 def _report_errors(app: fastapi.FastAPI) -> None:
     """Turn errors into one line of JSON."""
 
+    @app.exception_handler(InputError)
     def refused(request: fastapi.Request, error: Exception) -> Any:
         return JSON({"error": str(error)}, 400)
 
+    @app.exception_handler(fastapi.exceptions.RequestValidationError)
     def invalid(request: fastapi.Request, error: Any) -> Any:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         return JSON({"error": f"{where}: {first['msg']}"}, 422)
 
+    @app.exception_handler(HTTPException)
     def unknown(request: fastapi.Request, error: Any) -> Any:
         headers = getattr(error, "headers", None)
         return JSON({"error": error.detail}, error.status_code, headers)
-
-    app.add_exception_handler(InputError, refused)
-    app.add_exception_handler(fastapi.exceptions.RequestValidationError, invalid)
-    app.add_exception_handler(HTTPException, unknown)
 
 
 def _add_page(app: fastapi.FastAPI) -> None:
@@ -184,41 +166,14 @@ def _add_page(app: fastapi.FastAPI) -> None:
     add("/page.css", style.encode(), f"text/css; {TEXT}")
 
 
-def _add_reading(
-    app: fastapi.FastAPI, live: Live, views: Views, metrics: Metrics, *, emulated: bool
-) -> None:
+def _add_reading(app: fastapi.FastAPI, live: Live, views: Views, metrics: Metrics) -> None:
     """What anyone may read who reaches the server."""
     listeners: set[object] = set()
-
-    @app.get("/assets")
-    def assets() -> Any:
-        """All assets, the worst first."""
-        found = {"assets": views.assets(), "emulated": emulated, "revision": live.revision}
-        return JSON(found)
-
-    @app.get("/assets/{name:path}")
-    def asset(name: str, after: float | None = None) -> Any:
-        """An asset with its newest samples, or with those after a time in s since the epoch."""
-        return JSON(views.asset(name, after))
-
-    @app.get("/alarms")
-    def alarms(
-        asset: str | None = None,
-        before: Annotated[int | None, fastapi.Query(ge=0, lt=2**63)] = None,
-        limit: Annotated[int, fastapi.Query(ge=1, le=500)] = 50,
-    ) -> Any:
-        """Alarms with causes and acknowledgements, the newest first; `next` continues them."""
-        return JSON(views.alarms(asset, before, limit))
-
-    @app.get("/alarms/{sequence}")
-    def alarm(sequence: Sequence) -> Any:
-        """One alarm."""
-        return JSON(views.alarm(sequence))
-
-    @app.get("/alarms/{sequence}/samples")
-    def around(sequence: Sequence) -> Any:
-        """The samples around an alarm, and what its version of the twin predicts of them."""
-        return JSON(views.around(sequence))
+    app.get("/assets")(views.assets)
+    app.get("/assets/{name:path}")(views.asset)
+    app.get("/alarms")(views.alarms)
+    app.get("/alarms/{sequence}")(views.alarm)
+    app.get("/alarms/{sequence}/samples")(views.around)
 
     @app.get("/metrics", response_class=fastapi.responses.PlainTextResponse)
     def prometheus() -> Any:
@@ -311,23 +266,13 @@ def _add_versions(app: fastapi.FastAPI, live: Live, views: Views) -> None:
     async def comparison(twin: str, number: Number) -> Any:
         """The version compared with the active one on stored samples, at most a minute old."""
         found = await asyncio.wrap_future(comparisons.of(twin, number))
-        test = found.false_alarms
-        return JSON(
-            {
-                **{name: each for name, each in vars(found).items() if name != "false_alarms"},
-                **asdict(test),
-                "promised": test.samples / test.run_length,
-                "p": test.p,
-                "passed": test.passed,
-                "better": found.better,
-                "summary": found.summary,
-            }
-        )
+        made = dict(vars(found))
+        test = made.pop("false_alarms")
+        made |= asdict(test) | {"promised": test.samples / test.run_length}
+        made |= {"p": test.p, "passed": test.passed}
+        return JSON(made | {"better": found.better, "summary": found.summary})
 
-    @app.get("/versions/{twin:path}")
-    def versions(twin: str) -> Any:
-        """The versions of a twin."""
-        return JSON({"twin": twin, "versions": views.versions(twin)})
+    app.get("/versions/{twin:path}")(views.versions)
 
     @app.post("/versions/{twin:path}/rollback")
     def rollback(twin: str, body: Step) -> Any:
@@ -341,15 +286,12 @@ def _add_versions(app: fastapi.FastAPI, live: Live, views: Views) -> None:
         twin: str, number: Number, step: Literal["promote", "shadow", "reject"], body: Step
     ) -> Any:
         """Change the state of a version; one is promoted that is better than the active one."""
-        registry = Registry(live.store, twin)
+        registry, why = Registry(live.store, twin), list[Any]()
+        if step == "promote" and registry.active is not None:
+            why.append(await asyncio.wrap_future(comparisons.of(twin, number)))
+        elif step == "reject":
+            why.append(body.reason)
+        made = await asyncio.to_thread(getattr(registry, step), number, *why)
         if step == "promote":
-            evidence: Decision | None = None
-            if registry.active is not None:
-                evidence = await asyncio.wrap_future(comparisons.of(twin, number))
-            made = await asyncio.to_thread(registry.promote, number, evidence)
             await asyncio.to_thread(live.refresh)
-        elif step == "shadow":
-            made = await asyncio.to_thread(registry.shadow, number)
-        else:
-            made = await asyncio.to_thread(registry.reject, number, body.reason)
         return JSON(vars(made))

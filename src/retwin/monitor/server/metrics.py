@@ -45,9 +45,8 @@ class Metrics:
 
     def collect(self) -> Iterator[Any]:
         """The metrics of the assets; Prometheus' client calls it."""
-        samples = CounterMetricFamily(
-            "retwin_samples", "Samples by what was done with them.", labels=["asset", "result"]
-        )
+        what, labels = "Samples by what was done with them.", ["asset", "result"]
+        samples = CounterMetricFamily("retwin_samples", what, labels=labels)
         alarms = CounterMetricFamily("retwin_alarms", "Events since the start.", labels=["asset"])
         gauges = {
             name: GaugeMetricFamily(f"retwin_{name}", text, labels=["asset"])
@@ -62,9 +61,8 @@ class Metrics:
                 gauges[name].add_metric([each.asset], getattr(each, name))
             if each.time is not None:
                 gauges["newest_sample_seconds"].add_metric([each.asset], each.time / 1e9)
-        up = GaugeMetricFamily(
-            "retwin_source_up", "Whether a source is connected.", labels=["source"]
-        )
+        what = "Whether a source is connected."
+        up = GaugeMetricFamily("retwin_source_up", what, labels=["source"])
         for name, connected in self._sources.items():
             up.add_metric([name], connected())
         yield from (samples, alarms, *gauges.values(), up)

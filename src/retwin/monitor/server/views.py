@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from fastapi import Path, Query
+from fastapi.responses import JSONResponse
+from pydantic_core import to_jsonable_python
 
 from retwin.checks import given, require
 from retwin.data.trajectories import HEALTHY
@@ -43,9 +47,20 @@ after it."""
 KEPT = 16
 """Monitors that are kept in memory, besides those that watch."""
 
+Sequence = Annotated[int, Path(ge=0, lt=2**63)]
+Number = Annotated[int, Path(ge=1, lt=2**31)]
+
+
+class JSON(JSONResponse):
+    """An answer in ASCII, with null for numbers that JSON does not have."""
+
+    def render(self, content: Any) -> bytes:
+        """The bytes of the answer; texts may contain halves of surrogate pairs."""
+        return json.dumps(to_jsonable_python(content, inf_nan_mode="null")).encode()
+
 
 class Views:
-    """The state of the live monitor for the page.
+    """The state of the live monitor for the page; its methods answer requests.
 
     Parameters
     ----------
@@ -53,11 +68,14 @@ class Views:
         The monitor.
     explanations : Explanations, optional
         What explains alarms, for the kinds of faults; by default any change of the machine.
+    emulated : bool
+        Whether the page states that the machines are emulated.
 
     """
 
-    def __init__(self, live: Live, explanations: Explanations | None = None) -> None:
+    def __init__(self, live: Live, explanations: Explanations | None, *, emulated: bool) -> None:
         self._live = live
+        self._emulated = emulated
         self.journal = Journal(live.store)
         self._newest: dict[str, tuple[float | None, float]] = {}
 
@@ -76,22 +94,23 @@ class Views:
 
         self._monitor, self._causes = loaded, causes
 
-    def assets(self) -> list[dict[str, Any]]:
+    def assets(self) -> Any:
         """All assets, the worst first."""
         alarms, twins = self.journal.open(), self._twins()
         made = [self._status(each, alarms, twins) for each in self._live.status()]
         # Evidence by decades, so that healthy machines keep their order.
-        return sorted(
-            made,
+        made.sort(
             key=lambda each: (
                 ORDER.index(each["state"]),
                 -math.floor(math.log10(max(each["evidence"], 1e-3))),
                 each["asset"],
-            ),
+            )
         )
+        about = {"emulated": self._emulated, "revision": self._live.revision}
+        return JSON({"assets": made, **about})
 
-    def asset(self, name: str, after: float | None) -> dict[str, Any]:
-        """An asset with its newest samples, or those after a time."""
+    def asset(self, name: str, after: float | None = None) -> Any:
+        """An asset with its newest samples, or with those after a time in s since the epoch."""
         found = {each.asset: each for each in self._live.status()}.get(name)
         got, remedy = repr(name)[:80], "see /assets"
         status = given("asset", found, "one that is watched", got=got, remedy=remedy)
@@ -100,7 +119,7 @@ class Views:
         names = ([], [("score", "1")]) if scores else _channels(monitor.twin)
         times = recent.times / SECOND
         new = slice(0 if after is None else int(np.searchsorted(times, after, "right")), None)
-        return {
+        shown = {
             "status": self._status(status, self.journal.open(), twins),
             "arl": monitor.arl,
             "run_length": getattr(monitor, "run_length", monitor.arl),
@@ -113,14 +132,12 @@ class Views:
                 for each in self.journal.events(name)
             ],
             "evidence": recent.evidence[new].tolist(),
-            **_drawn(*names, recent, new),
         }
+        return JSON(shown | _drawn(*names, recent, new))
 
-    def around(self, sequence: int) -> dict[str, Any]:
-        """The stored samples around an alarm, or the trajectory of one, predicted anew.
-
-        None if they were removed. Of a trajectory it is what the twin does for its commands.
-        """
+    def around(self, sequence: Sequence) -> Any:
+        """The samples around an alarm, and what its version of the twin predicts of them."""
+        # None if they were removed. Of a trajectory it is what the twin does for its commands.
         alarm = self.journal.alarm(sequence)
         asset = next(each for each in self._live.store.assets() if each.name == alarm["asset"])
         monitor = self._monitor(asset.settings["twin"], alarm["version"])
@@ -143,25 +160,31 @@ class Views:
         recent = Recent(times, commands, measured, mean, deviation, np.zeros(len(times)))
         shown = 0 if whole else int(np.searchsorted(times, moment - round(SHOWN * period)))
         kind, drawn = "trajectory" if whole else "samples", slice(shown, None)
-        return {"kind": kind, **_drawn(*_channels(monitor.twin), recent, drawn)}
+        return JSON({"kind": kind, **_drawn(*_channels(monitor.twin), recent, drawn)})
 
-    def alarms(self, asset: str | None, before: int | None, limit: int) -> dict[str, Any]:
-        """A page of alarms, the newest first."""
+    def alarms(
+        self,
+        asset: str | None = None,
+        before: Annotated[int | None, Query(ge=0, lt=2**63)] = None,
+        limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    ) -> Any:
+        """Alarms with causes and acknowledgements, the newest first; `next` continues them."""
         found, following = self.journal.alarms(asset, before, limit)
         twins = self._twins()
-        return {"alarms": [self._explained(each, twins) for each in found], "next": following}
+        alarms = [self._explained(each, twins) for each in found]
+        return JSON({"alarms": alarms, "next": following})
 
-    def alarm(self, sequence: int) -> dict[str, Any]:
-        """One alarm, with what to check."""
-        return self._explained(self.journal.alarm(sequence), self._twins())
+    def alarm(self, sequence: Sequence) -> Any:
+        """One alarm."""
+        return JSON(self._explained(self.journal.alarm(sequence), self._twins()))
 
-    def versions(self, twin: str) -> list[dict[str, Any]]:
-        """The versions of a twin; InputError where there is none."""
+    def versions(self, twin: str) -> Any:
+        """The versions of a twin."""
         found = Registry(self._live.store, twin).versions()
         require(
             found, "twin", expected="one with versions", got=repr(twin)[:80], remedy="see /assets"
         )
-        return [vars(each) for each in found]
+        return JSON({"twin": twin, "versions": [vars(each) for each in found]})
 
     def _twins(self) -> dict[str, str]:
         """The name of the twin of each asset."""
@@ -251,33 +274,22 @@ ORDER = ("alarm", "void", "impossible", "stopped", "rate", "outside", "ok")
 """The states of assets, the worst first."""
 
 
-SENTENCES: Mapping[type, Callable[[Any, AnyMonitor], str]] = {
-    ParameterShift: lambda fault, monitor: (
-        "The machine has changed. Look for something that is open, leaks, is clogged, worn, loose "
-        f"or was replaced. Details: parameter {fault.parameter} of the twin."
-    ),
-    ParameterDrift: lambda fault, monitor: (
-        "The machine changes slowly. Look for what wears, fouls, ages, heats up or loosens, and "
-        f"compare it with earlier records. Details: parameter {fault.parameter} of the twin."
-    ),
-    ActuatorGain: lambda fault, monitor: (
-        f"The machine does not do what the command {_input(fault, monitor)} demands. Check the "
-        "actuator: its supply, its connection, its wear, and whether something limits or overrides "
-        "the command."
-    ),
-    SensorBias: lambda fault, monitor: (
-        f"The sensor of {_output(fault, monitor)} is offset. Compare it with a second instrument, "
-        "and check its mounting, its reference and its calibration."
-    ),
-    SensorDrift: lambda fault, monitor: (
-        f"The error of the sensor of {_output(fault, monitor)} grows with time. Compare it with a "
-        "second instrument now and again later, and check it for dirt, moisture and ageing."
-    ),
-    SensorFreeze: lambda fault, monitor: (
-        f"The sensor of {_output(fault, monitor)} repeats the same value. Check its cable, its bus "
-        "and the program that reads it, and whether its value changes when it must."
-    ),
+SENTENCES: Mapping[type, str] = {
+    ParameterShift: "The machine has changed. Look for something that is open, leaks, is clogged, "
+    "worn, loose or was replaced. Details: parameter {fault.parameter} of the twin.",
+    ParameterDrift: "The machine changes slowly. Look for what wears, fouls, ages, heats up or "
+    "loosens, and compare it with earlier records. Details: parameter {fault.parameter} of the "
+    "twin.",
+    ActuatorGain: "The machine does not do what the command {channel} demands. Check the actuator: "
+    "its supply, its connection, its wear, and whether something limits or overrides the command.",
+    SensorBias: "The sensor of {channel} is offset. Compare it with a second instrument, and check "
+    "its mounting, its reference and its calibration.",
+    SensorDrift: "The error of the sensor of {channel} grows with time. Compare it with a second "
+    "instrument now and again later, and check it for dirt, moisture and ageing.",
+    SensorFreeze: "The sensor of {channel} repeats the same value. Check its cable, its bus and "
+    "the program that reads it, and whether its value changes when it must.",
 }
+"""What to check for each kind of fault; `channel` is the command or the output that it changes."""
 NOTHING = (
     "None of the known faults explains the alarm better than the healthy machine does. Look at the "
     "samples around it; a single disturbance from outside is possible, and so is a false alarm."
@@ -293,13 +305,9 @@ def what_to_check(name: str, fault: object, monitor: AnyMonitor) -> str:
     """A sentence or two on what to check first, for the fault that a cause names."""
     if name == HEALTHY:
         return NOTHING
-    found = SENTENCES.get(type(fault))
-    return found(fault, monitor) if found else UNNAMED
-
-
-def _input(fault: ActuatorGain, monitor: AnyMonitor) -> str:
-    return monitor.twin.inputs.names[fault.actuator]
-
-
-def _output(fault: SensorBias | SensorDrift | SensorFreeze, monitor: AnyMonitor) -> str:
-    return monitor.twin.outputs.names[fault.output]
+    channel = ""
+    if isinstance(fault, ActuatorGain):
+        channel = monitor.twin.inputs.names[fault.actuator]
+    elif isinstance(fault, SensorBias | SensorDrift | SensorFreeze):
+        channel = monitor.twin.outputs.names[fault.output]
+    return SENTENCES.get(type(fault), UNNAMED).format(fault=fault, channel=channel)

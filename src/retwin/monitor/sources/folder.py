@@ -147,12 +147,8 @@ class Folder(Files[Layout]):
         self._report(f"{self.name}: {error}")
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """How the files of a machine are read: by which monitor's channels, and by which case."""
-
-    monitor: TrajectoryMonitor
-    case: Case | None = None
+Recorded = tuple[TrajectoryMonitor, Case | None]
+"""How the files of a machine are read: by which monitor's channels, and by which case."""
 
 
 @dataclass
@@ -211,23 +207,22 @@ class TrajectoryFolder(Files[Recorded]):
 
     def _trajectories(self, asset: str, path: Path, changed: int) -> list[Trajectory]:
         """Those of a file; without times of its own they begin when it was changed."""
-        own, twin = self._machines[asset], self._machines[asset].monitor.twin
+        monitor, case = self._machines[asset]
         if self._settings.mapping is None and path.suffix in (".csv", ".parquet"):
             return self._of_table(asset, path)
-        made = load(path, case=own.case, mapping=self._settings.mapping)
-        check_channels(twin, made, path.name)
+        made = load(path, case=case, mapping=self._settings.mapping)
+        check_channels(monitor.twin, made, path.name)
         length = round(made.steps * SECOND / made.rate)
-        values = np.concatenate(
-            [made.commands, np.where(made.mask, made.observed, np.nan)], axis=2, dtype=float
-        )
+        values = np.concatenate([made.commands, made.measured], axis=2, dtype=float)
         return [Trajectory(asset, changed + i * length, each) for i, each in enumerate(values)]
 
     def _of_table(self, asset: str, path: Path) -> list[Trajectory]:
         """The trajectory of a table with times, at the sample rate of the twin."""
-        own, twin = self._machines[asset], self._machines[asset].monitor.twin
+        monitor, case = self._machines[asset]
+        twin = monitor.twin
         channels = (*twin.inputs.names, *twin.outputs.names)
         times, rows = [], []
-        for part in layout_of(self._settings, channels, own.case).table(path).rows():
+        for part in layout_of(self._settings, channels, case).table(path).rows():
             for reason in part.bad:
                 self.refuse(reason)
             times.append(part.times)

@@ -260,12 +260,9 @@ def _parsed(line: bytes, where: str) -> Entry:
         found = json.loads(line)
         if not isinstance(found, dict) or found.keys() != KEYS:
             raise ValueError("it has other keys")
-        text, sequence = canonical(found.pop("data")), found["sequence"]
-        if type(sequence) is not int or not all(
-            isinstance(value, str) for key, value in found.items() if key != "sequence"
-        ):
+        entry = Entry(text=canonical(found.pop("data")), **found)
+        if [*map(type, vars(entry).values())] != [int, str, str, str, str]:
             raise ValueError("a value is of another type")
-        entry = Entry(text=text, **found)
         if entry.line != line:
             raise ValueError("it is written in another way")
     return entry

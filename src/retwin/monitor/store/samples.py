@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -98,19 +99,11 @@ class Committed:
     entries: list[Entry]
 
 
-@dataclass(frozen=True)
-class Packed:
-    """An update as rows of the tables: the times of its samples, their rows, and the state's."""
-
-    asset: str
-    key: int
-    times: NDArray
-    rows: list[tuple]
-    state: tuple | None
-
-
-def pack(update: Update, known: Mapping[str, tuple[int, int]]) -> Packed:
-    """An update as rows, with the keys and the channels of the store's assets by their names.
+def pack(
+    update: Update, known: Mapping[str, tuple[int, int]]
+) -> tuple[int, NDArray, list[tuple], list[tuple]]:
+    """An update as rows of the tables: the key of its asset, times and rows of its samples, and the
+    row of its state, if it has one. `known` are keys and channels of the store's assets.
 
     Raises
     ------
@@ -138,10 +131,10 @@ def pack(update: Update, known: Mapping[str, tuple[int, int]]) -> Packed:
     data, size = values.tobytes(), channels * WORD.itemsize
     rows = [(key, time, data[i * size : (i + 1) * size]) for i, time in enumerate(stamps.tolist())]
     if update.state is None:
-        return Packed(update.asset, key, stamps, rows, None)
+        return key, stamps, rows, []
     time = update.time if update.time is not None else max(stamps.tolist(), default=None)
     whole(f"time of the state of {update.asset}", time, at_least=EARLIEST, at_most=LATEST)
-    return Packed(update.asset, key, stamps, rows, (key, time, blob))
+    return key, stamps, rows, [(key, time, blob)]
 
 
 def one_asset(known: Mapping[str, T], name: str) -> T:
@@ -252,7 +245,7 @@ def parse(
 
     """
     rows: dict[str, list[tuple[int, list[float]]]] = {}
-    known: dict[str, dict[str, int]] = {}
+    known = cache(lambda name: {channel: i for i, channel in enumerate(channels(name))})
     trajectories: list[Samples | Trajectory] = []
     count = 0
     needed = {"values"} if asset is not None else {"asset", "values"}
@@ -273,9 +266,8 @@ def parse(
         name = each.get("asset", asset)
         if not isinstance(name, str) or asset not in (None, name):
             raise _refused(f"{place}: asset", name, "its name" if asset is None else repr(asset))
-        if name not in known:
-            known[name] = {channel: i for i, channel in enumerate(channels(name))}
-        time, block = _time(each, place), _block(given, length, known[name], place)
+        order = known(name)
+        time, block = _time(each, place), _block(given, length, order, place)
         if length:
             trajectories.append(Trajectory(name, time, np.array(block)))
         else:
@@ -344,12 +336,10 @@ def _block(values: Any, length: int, places: dict[str, int], place: str) -> list
             raise _refused(f"{place}: values", name, expected, remedy)
         column, several = value if length else [value], isinstance(value, list)
         if length and not (several and len(value) == length):
-            raise InputError(
-                f"{place}: {repr(name)[:60]}",
-                expected=f"an array of {length} numbers, as another channel has",
-                got=str(len(value)) if several else repr(value)[:60],
-                remedy="send one value per sample of each channel, null where it is missing",
-            )
+            got, expected = len(value) if several else value, f"an array of {length} numbers"
+            remedy = "send one value per sample of each channel, null where it is missing"
+            where = f"{place}: {repr(name)[:60]}"
+            raise _refused(where, got, f"{expected}, as another channel has", remedy)
         for row, each in zip(made, column, strict=True):
             try:
                 if not isinstance(each, int | float | None):

@@ -11,13 +11,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import instance, one_per, require, whole
-from retwin.monitor.store import database
 from retwin.monitor.store.audit import START, Entry, append, canonical
 from retwin.monitor.store.database import (
     Database,
@@ -25,6 +24,7 @@ from retwin.monitor.store.database import (
     last_entry,
     log,
     present,
+    sa,
     samples,
     states,
 )
@@ -34,18 +34,12 @@ from retwin.monitor.store.samples import (
     WORD,
     Asset,
     Committed,
-    Packed,
     Update,
     one_asset,
     pack,
 )
 from retwin.serialisation.files import refusing
 from retwin.serialisation.places import in_use
-
-if TYPE_CHECKING:
-    import sqlalchemy as sa
-else:
-    sa = database.sa
 
 FILE = "monitor.sqlite"
 """The database in the folder of the store, where no other is given."""
@@ -109,8 +103,11 @@ class Store:
             self._database = Database(self.folder / FILE, url, read_only=read_only)
             opened.callback(self._database.close)
             self._database.open()
-            if not read_only:
-                self._shrink()
+            if not read_only and max_samples is not None:
+                with self._writing() as connection:
+                    for key, _ in self._known(connection).values():
+                        self._remove_surplus(connection, key)
+                self._database.shrink()
             self._opened = opened.pop_all()
 
     def __enter__(self) -> Store:
@@ -193,17 +190,16 @@ class Store:
         with self._writing() as connection:
             known = self._known(connection)
             packed = [pack(each, known) for each in updates]
-            names = [each.asset for each in packed]
+            names = [each.asset for each in updates]
             one_per("updates", names, len(set(names)), "asset", remedy="join the samples of each")
-            repeated = {}
-            rows = []
-            for each in packed:
-                new = self._new(connection, each)
+            repeated, inserted, latest = {}, list[tuple](), list[tuple]()
+            for name, (key, times, rows, state) in zip(names, packed, strict=True):
+                new = self._new(connection, key, times)
                 if not new.all():
-                    repeated[each.asset] = each.times[~new]
-                rows += [each.rows[i] for i in np.flatnonzero(new)]
-            self._database.insert(connection, samples, rows)
-            latest = [each.state for each in packed if each.state]
+                    repeated[name] = times[~new]
+                inserted += [rows[i] for i in np.flatnonzero(new)]
+                latest += state
+            self._database.insert(connection, samples, inserted)
             if latest:
                 keys = [row[0] for row in latest]
                 connection.execute(states.delete().where(states.c.asset.in_(keys)))
@@ -213,8 +209,8 @@ class Store:
                 self._last = append(self._last, kind, data)
                 chained.append(self._last)
             self._database.insert(connection, log, [astuple(entry) for entry in chained])
-            for each in packed:
-                self._remove_surplus(connection, each.key)
+            for key, *_ in packed:
+                self._remove_surplus(connection, key)
         return Committed(repeated, chained)
 
     def samples(self, asset: str, after: int | None = None) -> Iterator[tuple[NDArray, NDArray]]:
@@ -333,18 +329,17 @@ class Store:
                 self._stale = True
                 raise
 
-    def _new(self, connection: Any, packed: Packed) -> NDArray:
+    def _new(self, connection: Any, key: int, times: NDArray) -> NDArray:
         """Whether each sample (n,) is neither stored nor repeated; it is counted as stored."""
-        times = packed.times
         if not len(times):
             return np.ones(0, dtype=bool)
-        held = self._held_by(connection, packed.key)
+        held = self._held_by(connection, key)
         if times[0] > held.latest and (np.diff(times) > 0).all():  # the usual case: no query
             new = np.ones(len(times), dtype=bool)
         else:
             new = np.zeros(len(times), dtype=bool)
             new[np.unique(times, return_index=True)[1]] = True
-            new &= ~np.isin(times, present(connection, packed.key, times))
+            new &= ~np.isin(times, present(connection, key, times))
         held.latest = max(held.latest, int(times.max()))
         held.count += int(new.sum())
         return new
@@ -371,15 +366,6 @@ class Store:
         last = connection.execute(times.limit(1).offset(place)).scalar_one()
         connection.execute(samples.delete().where(own, samples.c.time <= last))
         held.count = self._max_samples
-
-    def _shrink(self) -> None:
-        """Apply `max_samples` to all assets, and give free pages back."""
-        if self._max_samples is None:
-            return
-        with self._writing() as connection:
-            for key, _ in self._known(connection).values():
-                self._remove_surplus(connection, key)
-        self._database.shrink()
 
 
 @dataclass

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -118,7 +118,8 @@ def _of_samples(store: Store, twin: str, watching: Sequence[Any]) -> Scored:
             continue
         known = np.where(np.isfinite(seen[0].score) & np.isfinite(seen[1].score), measured, np.nan)
         found = [crps_normal(known, each.mean, each.deviation) for each in seen[:2]]
-        scores.append([_mean(each[0] / _deviation(measured[0])) for each in found])
+        relative = np.ma.masked_invalid(np.stack(found)[:, 0] / _deviation(measured[0]))
+        scores.append(relative.mean(axis=2).filled(np.nan))  # over the outputs that are measured
         alarms += [len(each.events) for each in seen]
     expected = f"at least {2 * MIN_SAMPLES} without an alarm, of one asset"
     require(scores, "samples", expected=expected, got="fewer", remedy=LATER)
@@ -142,8 +143,8 @@ def _of_trajectories(store: Store, twin: str, watching: Sequence[Any]) -> Scored
     every = [each for part in machines for each in part]
     what = "healthy ones that are stored, of all machines together"
     at_least("trajectories", every, MIN_TRAJECTORIES, what, remedy=LATER)
-    outputs = [np.where(each.mask, each.observed, np.nan)[0] for each in every]
-    unit = _deviation(np.concatenate(outputs).astype(float))
+    outputs = np.concatenate([each.measured[0] for each in every])
+    unit = _deviation(outputs.astype(float))
     twins = [_predicting(each) for each in watching[:2]]
     length = len(every) // BLOCKS
     scores: list[NDArray] = []
@@ -151,14 +152,6 @@ def _of_trajectories(store: Store, twin: str, watching: Sequence[Any]) -> Scored
         pairs = np.array([[_crps(own, each, unit) for each in part] for own in twins])
         scores += np.array_split(pairs, max(1, len(part) // length), axis=1)
     return scores, [_tested(each, machines) for each in watching[1:]]
-
-
-def _mean(scores: NDArray) -> NDArray:
-    """The mean over outputs (T, d_y) of those that are measured; NaN where none is."""
-    seen = np.isfinite(scores)
-    count = seen.sum(axis=1)
-    total = np.where(seen, scores, 0.0).sum(axis=1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def _machines(store: Store, twin: str) -> Iterator[tuple[str, int, Mapping[str, NDArray]]]:
@@ -169,7 +162,7 @@ def _machines(store: Store, twin: str) -> Iterator[tuple[str, int, Mapping[str, 
             yield asset.name, *state
 
 
-def _moments(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
+def collect_times(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
     """The times of that name of the entries of some kinds of the log, by their assets."""
     found: dict[str, list[int]] = {}
     for entry in (each for kind in kinds for each in store.log(kind)):
@@ -180,7 +173,8 @@ def _moments(store: Store, key: str, *kinds: str) -> dict[str, list[int]]:
 
 def _healthy_samples(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
     """The healthy samples (T, d_u + d_y) of each asset of a twin."""
-    alarms, period = _moments(store, "time", "alarm", "remark", "end"), SECOND / monitor.twin.rate
+    alarms = collect_times(store, "time", "alarm", "remark", "end")
+    period = SECOND / monitor.twin.rate
     for name, newest, _ in _machines(store, twin):
         first = newest - round(MAX_SAMPLES * period)
         times, rows = gridded(store, name, monitor.twin, first, newest)
@@ -209,7 +203,7 @@ def _healthy_trajectories(
 
     Those with nothing measured are left out.
     """
-    alarms, machines = _moments(store, "begin", "alarm"), list(_machines(store, twin))
+    alarms, machines = collect_times(store, "begin", "alarm"), list(_machines(store, twin))
     for asset, _, state in machines:
         known = state.get("trajectories", np.zeros((0, 3), dtype=np.int64))
         ends = np.flatnonzero(np.isin(known[:, 0], alarms.get(asset, [])))
@@ -235,9 +229,7 @@ def _predicting(monitor: TrajectoryMonitor) -> Twin:
 
 def _deviation(measured: NDArray) -> NDArray:
     """The standard deviation (d_y,) of each output (T, d_y); 1 for one that is constant."""
-    seen = np.isfinite(measured).any(axis=0)
-    found = np.ones(measured.shape[1])
-    found[seen] = np.nanstd(measured[:, seen], axis=0)
+    found = np.ma.masked_invalid(measured).std(axis=0).filled(1.0)
     return np.where(found > 0, found, 1.0)
 
 
@@ -247,20 +239,6 @@ def _crps(twin: Twin, record: Trajectories, unit: NDArray) -> float:
         warnings.simplefilter("ignore")
         found = simulate_records(twin, record, draws=DRAWS, seed=0).crps[0] / unit
     return float(found[record.mask[0]].mean())
-
-
-@dataclass(eq=False)
-class _Made:
-    """A comparison, and until when it is kept once it is done."""
-
-    future: Future[Decision]
-    begun: float = field(default_factory=time.monotonic)
-    until: float = float("inf")
-
-    def done(self, _: object) -> None:
-        """Note that it is done."""
-        now = time.monotonic()
-        self.until = now + max(FRESH, PATIENCE * (now - self.begun))
 
 
 class Comparisons:
@@ -276,18 +254,26 @@ class Comparisons:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._worker = ThreadPoolExecutor(1, "comparison")
-        self._made: dict[tuple[str, int], _Made] = {}
+        self._made: dict[tuple[str, int], Future[Decision]] = {}
+        self._until: dict[Future[Decision], float] = {}
+        """Until when a comparison is kept that is done."""
         self._lock = threading.Lock()
 
     def of(self, twin: str, number: int) -> Future[Decision]:
         """The comparison of a version with the active one."""
         key, now = (twin, number), time.monotonic()
         with self._lock:
-            self._made = {each: made for each, made in self._made.items() if now < made.until}
+            for each, made in list(self._made.items()):
+                if now >= self._until.get(made, np.inf):
+                    del self._made[each], self._until[made]
             if key not in self._made:
                 count = len(self._made) + 1
                 at_most("comparison", count, QUEUE, "at a time", remedy="wait for a minute")
-                made = _Made(self._worker.submit(compare, self._store, twin, number))
-                self._made[key] = made
-                made.future.add_done_callback(made.done)
-            return self._made[key].future
+                self._made[key] = self._worker.submit(compare, self._store, twin, number)
+                self._made[key].add_done_callback(partial(self._keep, now))
+            return self._made[key]
+
+    def _keep(self, begun: float, made: Future[Decision]) -> None:
+        """Note until when a comparison is kept."""
+        now = time.monotonic()
+        self._until[made] = now + max(FRESH, PATIENCE * (now - begun))

@@ -19,6 +19,7 @@ from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.store.gridded import gridded, record_of
 from retwin.monitor.store.samples import SECOND
 from retwin.monitor.store.store import Store
+from retwin.monitor.versions.comparison import collect_times
 from retwin.monitor.versions.decision import MIN_SAMPLES
 from retwin.monitor.versions.registry import Registry, Version
 
@@ -98,12 +99,7 @@ def _events(store: Store, asset: str, new_normal: str) -> tuple[int, list[tuple[
         An event lasts, or was a change, and nobody says that it is the new normal.
 
     """
-    opened = {
-        int(entry.data["event"])
-        for kind in ("alarm", "remark")
-        for entry in store.log(kind)
-        if entry.data["asset"] == asset
-    }
+    opened = set(collect_times(store, "event", "alarm", "remark").get(asset, []))
     ends = [entry.data for entry in store.log("end") if entry.data["asset"] == asset]
     closed = {int(each["event"]): int(each["time"]) for each in ends}
     lasting = sorted(opened - closed.keys())

@@ -7,7 +7,7 @@ machine, from a diagnosis by inversion.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,13 +17,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retwin.checks import finite, positive, whole
-from retwin.data.trajectories import UNKNOWN, Trajectories
+from retwin.checks import finite, instance, nothing, positive, require, whole
+from retwin.data.trajectories import HEALTHY, UNKNOWN, Trajectories
 from retwin.diagnosis.diagnoser import load_diagnoser
+from retwin.errors import InputError
 from retwin.monitor.detect.detector import LARGEST, Detector
-from retwin.monitor.detect.offsets import OffsetModel, is_bias
-from retwin.monitor.detect.promise import MAX_RUN_LENGTH, MIN_RUN_LENGTH, duration
-from retwin.monitor.detect.scores import ConformalScores, middle
+from retwin.monitor.detect.offsets import SIZES, OffsetModel, biases, fit_offsets, is_bias
+from retwin.monitor.detect.promise import (
+    MAX_RUN_LENGTH,
+    MIN_RUN_LENGTH,
+    duration,
+    false_alarms,
+)
+from retwin.monitor.detect.scores import ConformalScores, fit_scores, middle
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.detect.validity import Validity
 from retwin.monitor.models.trajectory.evidence import (
@@ -43,6 +49,8 @@ from retwin.monitor.models.trajectory.state import (
 )
 from retwin.progress import Progress
 from retwin.serialisation.models import check_weights, read_model, refusing, write_model
+from retwin.twins.faults.actuator_faults import Fault
+from retwin.update.dynamics.filter.noise import CERTAIN
 
 KIND = "trajectory_monitor"
 """Kind of the saved model."""
@@ -51,6 +59,12 @@ SHOWN = 0.01
 COMPARABLE = 1.25
 """Factor by which an output may have fewer or more measured values than in any trajectory of the
 calibration: the mean error of a trajectory then varies by an eighth more or less."""
+MIN_TRAJECTORIES = 8
+"""Healthy trajectories of a calibration, at least."""
+FACTORS = np.arange(1.0, 10.005, 0.01)
+"""Factors of the errors of which the smallest is taken with which the calibration agrees."""
+NUMBERS = ("kappa", "arl", "duration", "alpha", "used", "given")
+"""Attributes that are saved as numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,19 +157,16 @@ class TrajectoryMonitor:
         return {"trajectories": self.promise}
 
     @cached_property
-    def _tests(self) -> tuple[Detector, Validity]:
-        detector = Detector(self.slack)
-        return detector, Validity(detector, self.arl, self.alpha)
+    def _validity(self) -> Validity:
+        return Validity(Detector(self.slack), self.arl, self.alpha)
 
     def start(self) -> TrajectoryState:
         """What is known of a machine before its first trajectory."""
-        detector, validity = self._tests
-        own = np.zeros(len(alternatives(self.diagnoser)))
-        pooled = np.zeros((0, 0))
+        own, pooled = np.zeros(len(alternatives(self.diagnoser))), np.zeros((0, 0))
         if self.offsets is not None:
-            none = np.zeros((1, 0, len(self.offsets.mean)))
-            pooled = np.zeros_like(self.offsets.ratio(none, self.diagnoser.faults.values())[0])
-        return TrajectoryState(own, pooled, detector.start(1), validity.start(1))
+            pooled = np.zeros((len(biases(self.diagnoser.faults.values())), len(SIZES)))
+        tests = self._validity.detector.start(1), self._validity.start(1)
+        return TrajectoryState(own, pooled, *tests)
 
     def watch(
         self,
@@ -194,7 +205,7 @@ class TrajectoryMonitor:
         alarms = []
         for t, steps in enumerate(self._factors(found)):
             state, evidence[t], shares = self._step(state, steps, low[:, t], high[:, t])
-            void[t] = self._tests[1].void(state.validity)[0]
+            void[t] = self._validity.void(state.validity)[0]
             if shares:
                 name, probability = next(iter(shares.items()))
                 about = str(trajectories.ids[t]), state.count - 1, name, float(evidence[t])
@@ -229,12 +240,12 @@ class TrajectoryMonitor:
         high: NDArray,
     ) -> tuple[TrajectoryState, float, dict[str, float]]:
         """The state after a trajectory, the evidence, and at an alarm the shares of its causes."""
-        detector, validity = self._tests
+        validity = self._validity
         own, pooled = (
             before if factor is None else np.minimum((before + 1) * factor, LARGEST)
             for before, factor in zip((state.evidence, state.pooled), step, strict=True)
         )
-        detected, against = detector.step(state.detector, low, high)
+        detected, against = validity.detector.step(state.detector, low, high)
         parts = [own.mean(), against[0], *([pooled.mean()] if pooled.size else [])]
         evidence = float(np.mean(parts))
         alarm = evidence >= self.arl
@@ -242,7 +253,7 @@ class TrajectoryMonitor:
         shares = self._shares(own, pooled, against[0]) if alarm else {}
         if alarm:
             own, pooled = np.zeros_like(own), np.zeros_like(pooled)
-        detected = detector.reset(detected, np.array([alarm]))
+        detected = validity.detector.reset(detected, np.array([alarm]))
         return TrajectoryState(own, pooled, detected, tested, state.count + 1), evidence, shares
 
     def _shares(self, own: NDArray, pooled: NDArray, against: float) -> dict[str, float]:
@@ -298,5 +309,82 @@ class TrajectoryMonitor:
             )
 
 
-NUMBERS = ("kappa", "arl", "duration", "alpha", "used", "given")
-"""Attributes that are saved as numbers."""
+def fit_trajectory_monitor(
+    diagnoser: Inversion,
+    healthy: Trajectories,
+    false_alarms_at_most: str | float = "1 per month",
+    *,
+    causes: Mapping[str, Fault] | None = None,
+    alpha: float = 0.01,
+    progress: Progress | None = None,
+) -> TrajectoryMonitor:
+    """Calibrate a monitor on trajectories of the healthy machine.
+
+    Parameters
+    ----------
+    diagnoser : InversionDiagnoser or StateInversionDiagnoser
+        Of `fit_inversion`, with the faults.
+    healthy : Trajectories
+        Healthy trajectories, at least 8, best of several days, that the twin was not fitted to.
+    false_alarms_at_most : str or float
+        See `false_alarms`; "1 per month" is one of a machine that works without pause, and
+        "1000 trajectories" or a number is the average run length itself.
+    causes : mapping of str to Fault, optional
+        Further faults to watch for, beside those of the diagnoser, such as `Case.causes`.
+    alpha : float
+        Probability of declaring the promise void although it applies.
+    progress : callable, optional
+        Called with the finished share.
+
+    Returns
+    -------
+    TrajectoryMonitor
+        With its promise.
+
+    Raises
+    ------
+    InputError
+        Too few trajectories, other channels or another rate than those of the twin, no diagnoser
+        by inversion, or trajectories that look faulty to it.
+
+    """
+    diagnoser = checked(checked(diagnoser).with_faults(causes or {}))
+    instance("healthy", healthy, Trajectories, remedy="load recorded ones")
+    finite("alpha", alpha, at_least=1e-12, at_most=0.5)
+    allowed = {HEALTHY, *(name for name, fault in diagnoser.faults.items() if fault is None)}
+    faulty = [f"some labelled {name}" for name in sorted(healthy.known_labels - allowed)[:3]]
+    expected = f"trajectories without labels, or labelled {' or '.join(sorted(allowed))}"
+    nothing("healthy", faulty, expected, remedy="leave these out")
+    length = healthy.steps / healthy.rate
+    arl = false_alarms(false_alarms_at_most, 1 / length)
+    found = compared(diagnoser, healthy, progress)
+    used = np.isfinite(found.error) & ~found.outside
+    require(
+        used.sum() >= MIN_TRAJECTORIES,
+        "healthy",
+        expected=f"at least {MIN_TRAJECTORIES} trajectories",
+        got=f"{len(healthy)}, of which {int(found.unmeasured.sum())} without measured samples, "
+        f"{int(found.implausible.sum())} with implausible readings and "
+        f"{int(found.outside.sum())} with commands outside their range in training",
+        remedy="record more healthy trajectories, with commands as those of the twin's training",
+    )
+    ratio, count = found.ratio[used], found.measured[used]
+    scores = fit_scores(found.error[None, used])
+    (slack,) = scores.slack(1)
+    some = bool(biases(diagnoser.faults.values()))
+    offsets = fit_offsets(found.offset[used]) if some else None
+    for kappa in FACTORS[slack.kappa <= FACTORS]:
+        factor = factors(ratio, kappa).mean(axis=1)
+        bound = factor.mean() + CERTAIN * factor.std(ddof=1) / np.sqrt(len(factor))
+        if bound <= 1:
+            measured = np.stack([count.min(axis=0), count.max(axis=0)]).astype(float)
+            about = float(kappa), arl, length, measured, offsets, float(alpha)
+            counts = int(used.sum()), len(healthy)
+            return TrajectoryMonitor(diagnoser, scores, slack, *about, *counts)
+    likely = alternatives(diagnoser)[int(np.median(ratio, axis=0).argmax())]
+    raise InputError(
+        "healthy",
+        expected="trajectories that the diagnoser takes for healthy ones",
+        got=f"some that look like {likely}",
+        remedy="leave out faulty ones, or calibrate the twin on more healthy trajectories",
+    )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from retwin.checks import instance, require
 from retwin.monitor.detect.detector import DetectorState
 from retwin.monitor.detect.validity import ValidityState
-from retwin.monitor.models.monitor_state import arrays_of, part_of
+from retwin.monitor.models.state import arrays_of, part_of
 from retwin.serialisation.files import refusing
 
 
