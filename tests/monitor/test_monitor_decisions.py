@@ -491,7 +491,7 @@ def test_a_size_at_an_end_of_its_range_is_told() -> None:
     assert cause._at_limit(LEAK, (0.2, 0.1 + 0.9 * margin, 0.3))
     none = replace(LEAK, size=(0.0, 1.0))  # no change is the end of the fault, and not of its range
     assert not cause._at_limit(none, (0.1, 0.0, 0.2))
-    data = cause_data("leak", 0.9, 0.1, {}, (0.9, 0.8, 1.0), "m2", limit=True)
+    data = cause_data("leak", 0.9, 0.1, {}, (0.9, 0.8, 1.0), "m2") | {"limit": True}
     assert "(0.8 to 1) at the end of its range, probability" in cause_text(data, "")
 
 
@@ -506,6 +506,7 @@ def found_cause(
     better: bool = False,
     current: str = "leak",
     unexplained: float = 0.0,
+    onset: float = 0.0,
     found: dict | None = None,
 ) -> tuple[bool, list[int]]:
     """Whether a further alarm is of the same cause, and the windows that it was found from."""
@@ -519,10 +520,13 @@ def found_cause(
         def diagnose(self, window: rt.Trajectories, **_: object) -> object:
             steps.append(window.steps)
             rest = (1 - probability) / 2
-            none = SimpleNamespace(**dict.fromkeys(("value", "low", "high"), np.zeros((1, 3))))
+            none, since = (
+                SimpleNamespace(**dict.fromkeys(("value", "low", "high"), np.full((1, 3), each)))
+                for each in (0.0, onset)
+            )
             given = np.array([[probability if each == name else rest for each in classes]])
             own = {"probabilities": given, "unknown": [unknown], "classes": classes}
-            return SimpleNamespace(**own, size=none, onset=none)
+            return SimpleNamespace(**own, size=none, onset=since)
 
     monkeypatch.setattr(cause, "StateInversionDiagnoser", Diagnoser)
     monkeypatch.setattr(cause, "moved", lambda twin, _: twin)
@@ -538,6 +542,17 @@ def found_cause(
     if found is not None:
         found |= vars(made)
     return made.same, steps
+
+
+@pytest.mark.parametrize("samples", [0, 1, 2])
+def test_an_onset_at_the_begin_of_what_was_looked_at_may_be_earlier(
+    samples: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: dict = {}
+    period = 1 / recorded(0).rate
+    found_cause(monkeypatch, "leak", 0.9, 0.0, samples=(200,), onset=samples * period, found=found)
+    assert found["earlier"] is (samples <= 1)
+    assert ("from noon or earlier;" in cause_text(found, "noon")) is (samples <= 1)
 
 
 @pytest.mark.parametrize(

@@ -29,11 +29,9 @@ def test_bands_of_few_independent_errors_hold_further_ones(independent: int) -> 
     assert np.mean(held) == pytest.approx(0.9, abs=0.03)
 
 
-def errors_with(memory: float) -> ForecastErrors:
-    one = np.ones((1, 1))
-    return ForecastErrors(
-        np.array([np.inf]), one, one, one, memory, np.array([0.0, -1.0]), np.array([2.0, 1.0]), 0.1
-    )
+def errors_with(memory: float, beyond: tuple[float, float] = (0.1, 0.1)) -> ForecastErrors:
+    one, low, high = np.ones((1, 1)), np.array([0.0, -1.0]), np.array([2.0, 1.0])
+    return ForecastErrors(np.array([np.inf]), one, one, one, memory, low, high, np.array(beyond))
 
 
 def test_bands_end_where_a_value_leaves_its_range_until_that_is_forgotten() -> None:
@@ -46,6 +44,10 @@ def test_bands_end_where_a_value_leaves_its_range_until_that_is_forgotten() -> N
     assert not outside[0].any()
     np.testing.assert_array_equal(np.flatnonzero(outside[1]), np.arange(10, 16))
     np.testing.assert_array_equal(np.flatnonzero(outside[2]), np.arange(20, 50))
+    # Each value as far as it was shown that it may.
+    outside = errors_with(0.5, (0.1, 1.0)).outside(values, rate=10.0)
+    np.testing.assert_array_equal(np.flatnonzero(outside[1]), np.arange(10, 16))
+    assert not outside[2].any()
 
 
 def test_excess_is_in_widths_of_the_range_and_of_a_constant_in_its_size() -> None:
@@ -67,6 +69,7 @@ def test_saved_values_that_do_not_fit_are_refused() -> None:
     assert (limited.values["longest"], limited.values["drifts"]) == (3.0, True)
     np.testing.assert_array_equal(np.flatnonzero(limited.late(35, 10.0)), np.arange(30, 35))
     before = {name: each for name, each in values.items() if name not in ("longest", "drifts")}
+    before["beyond"] = 0.1
     assert ForecastErrors.of(before).values == values  # type: ignore[union-attr]
     with pytest.raises(rt.InputError, match="ranges from low to high"):
         ForecastErrors.of(values | {"low": [5.0, 5.0]})

@@ -202,7 +202,7 @@ def evaluate(
         {"scores": [asdict(each) for each in scores], "records": len(records)},
         f"{count}, {how}:",
         table(heads, rows, numbers=heads[2:6]),
-        *_verdict(scores),
+        *_verdict(scores, started=bool(begin)),
         *fitted_remarks(model, records, "these are no scores of new ones"),
         *([] if ahead or begin else _start_remarks(updated, records, scores, units, seed)),
         as_json=as_json,
@@ -285,7 +285,7 @@ def _foreign(scores: list[ModelScore]) -> list[str]:
     ]
 
 
-def _verdict(scores: list[ModelScore]) -> list[str]:
+def _verdict(scores: list[ModelScore], *, started: bool = False) -> list[str]:
     """What is better than the model, and whether its bands hold, in sentences."""
     from retwin.scores.uses import COVERAGE
     from retwin.update.forecast_errors import LEVEL
@@ -319,8 +319,8 @@ def _verdict(scores: list[ModelScore]) -> list[str]:
                     "chance: score more of other days before you rely on it."
                 )
                 continue
+            other = "" if started else ", or begin in other states, which --warm-up infers"
             made.append(
-                f"{text}: do not rely on it here. These records may be of another day, or begin in "
-                "other states than the model, which --warm-up infers."
+                f"{text}: do not rely on it here. These records may be of another day{other}."
             )
     return made

@@ -14,7 +14,7 @@ from retwin.evaluation.choice.fitted import CandidateScore
 from retwin.evaluation.choice.folds import RECORDS
 from retwin.scores.residuals import autocorrelation, ljung_box
 from retwin.update.forecast_errors import USUAL, ForecastErrors
-from retwin.update.forecasts import errors_drift
+from retwin.update.forecasts import begin_of, errors_drift
 
 LONGEST = 0.1
 """Longest dead time that is tried, over the length of a record."""
@@ -107,7 +107,7 @@ def start_remarks(records: Trajectories, errors: ForecastErrors | None, begin: f
     return [
         "Records begin in different states, and the model at the mean of them. With starts that "
         f"the first tenth of a record gives, 90 % bands are: {', '.join(found)} (evaluate, "
-        f"generate --bands: --warm-up TIME).{compared}"
+        f"generate --bands: --warm-up {begin_of(records):g}s).{compared}"
     ]
 
 

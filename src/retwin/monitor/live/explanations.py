@@ -213,8 +213,8 @@ class Explanations:
         size, onset = ([each if np.isfinite(each) else None for each in end] for end in ends)
         moments = [None if each is None else first + round(each * SECOND) for each in onset]
         shares = cause.probability, cause.unknown, cause.probabilities
-        data = cause_data(cause.name, *shares, size, cause.unit, moments, limit=cause.limit)
-        return data | {"same": cause.same}
+        about = {"limit": cause.limit, "earlier": cause.earlier, "same": cause.same}
+        return cause_data(cause.name, *shares, size, cause.unit, moments) | about
 
 
 def _alarm(data: dict[str, Any], first: int, period: float) -> Alarm:

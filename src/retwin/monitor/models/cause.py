@@ -77,6 +77,8 @@ class Cause:
         Of the size; "" where it has none.
     limit : bool
         Whether the size is at an end of the range in which it was searched.
+    earlier : bool
+        Whether the onset may be before the samples by which the cause was inferred.
 
     """
 
@@ -90,6 +92,7 @@ class Cause:
     same: bool = False
     unit: str = ""
     limit: bool = False
+    earlier: bool = False
 
     @property
     def likely(self) -> bool:
@@ -106,6 +109,7 @@ def cause_text(cause: Mapping[str, Any], since: str) -> str:
     more = cause["unknown"] > PROBABLE and known
     doubt = "not clear, most likely " * (known and cause["probability"] < PROBABLE)
     name = doubt + cause["name"] if known else "no known fault"
+    since += " or earlier" * bool(since and cause.get("earlier"))
     text = name + (f" from {since}" if since else "")
     text += ", and more than that" if since and more else ""
     value, low, high = cause["size"]
@@ -138,8 +142,6 @@ def cause_data(
     size: Sequence[float | None] = (None,) * 3,
     unit: str = "",
     onset: Sequence[float | None] = (None,) * 3,
-    *,
-    limit: bool = False,
 ) -> dict[str, Any]:
     """A cause as data of the log, None where there is no number; see `Cause`.
 
@@ -151,7 +153,8 @@ def cause_data(
         "unknown": unknown,
         "size": list(size),
         "unit": unit,
-        "limit": limit,
+        "limit": False,
+        "earlier": False,
         "onset": list(onset),
         "probabilities": dict(probabilities),
     }
@@ -380,17 +383,18 @@ class CauseSearch:
             value, low, high = (shift + float(each) for each in parts)
             return value, low, high
 
-        name, size = made.classes[best], interval(made.size)
+        name, size, onset = made.classes[best], interval(made.size), interval(made.onset, begin)
         return Cause(
             alarm,
             name,
             float(made.probabilities[0, best]),
             float(made.unknown[0]),
             size,
-            interval(made.onset, begin),
+            onset,
             dict(zip(made.classes, made.probabilities[0].tolist(), strict=True)),
             unit=size_unit(self.faults[name], self.twin),
             limit=_at_limit(self.faults[name], size),
+            earlier=not known_start and onset[1] <= begin + 1 / rate,
         )
 
     def _better(

@@ -393,7 +393,7 @@
       about.replaceChildren(h("h1", {}, found.asset, ": ", why && why.probability >= 0.5 ? fault(why.name) : cause(found)),
         verdict("alarm", `Event since ${stamp(found.time)}${course(found)}; ${found.output}: ${found.change}. The twin of the healthy machine does not explain it.`,
           h("a", { href: to("asset", found.asset) }, "See the machine now")),
-        facts(found.begin ? ["Trajectory", stamp(found.begin), `to ${clock(found.time)}`] : ["Began", why && why.onset[0] != null ? stamp(why.onset[0]) : "–", why && why.onset[1] != null && `90 % interval ${clock(why.onset[1])} to ${clock(why.onset[2])}`],
+        facts(found.begin ? ["Trajectory", stamp(found.begin), `to ${clock(found.time)}`] : ["Began", why && why.onset[0] != null ? `${stamp(why.onset[0])}${why.earlier ? " or earlier" : ""}` : "–", why && why.onset[1] != null && `90 % interval ${clock(why.onset[1])} to ${clock(why.onset[2])}`],
           ...(found.begin ? [] : [["Size", ...(why ? interval(why.size, why.unit, why.limit) : ["–"])]]),
           ["Evidence", digits(found.evidence), `alarm from ${digits(found.arl)} on`],
           ["Version of the twin", `${found.version}`]),
