@@ -271,6 +271,8 @@ def _print(found: Fitted, base: StandIn, out: Path, *, as_json: bool) -> None:
             shown += [f"{each.title}:", table(heads, rows, numbers=heads[1:]), ""]
     if found.parts and found.chosen == found.preferred:
         shown.insert(2, "→ is the first within one standard error of the best CRPS.")
+    if found.parts:
+        shown.insert(2, f"Errors are those of {found.how}.")
     figures, outputs = base.figures, found.records.outputs
     if figures:
         own = [

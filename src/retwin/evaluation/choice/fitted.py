@@ -41,8 +41,8 @@ class CandidateScore:
     difference, standard_error : float
         Of `crps` from that of the best candidate, over blocks; of a model without the twin, from
         that of the chosen one over the parts in time.
-    coverage : float
-        Share of samples inside 90 % bands that other parts calibrated.
+    coverage : dict of str to float
+        By output, the share of samples inside 90 % bands that other parts calibrated.
     seconds : float
         Processor time of all fits.
     reason : str
@@ -59,7 +59,7 @@ class CandidateScore:
     crps: float
     difference: float
     standard_error: float
-    coverage: float
+    coverage: dict[str, float]
     seconds: float
     reason: str = ""
     uses_twin: bool = True

@@ -413,7 +413,7 @@ def _row(
     title = CANDIDATES.get(name, name)
     if reason or comparison is None or name not in comparison.predicted:
         n = float("nan")
-        return CandidateScore(name, title, {}, n, n, n, n, n, seconds, reason)
+        return CandidateScore(name, title, {}, n, n, n, n, {}, seconds, reason)
     rmse = comparison.rmse(name)
     names = comparison.records.outputs.names
     return CandidateScore(
@@ -423,7 +423,7 @@ def _row(
         float(np.mean(rmse / comparison.spread)),
         float(comparison.block_scores(name).mean()),
         *differences[name],
-        float(np.mean(comparison.coverage(name))),
+        dict(zip(names, comparison.coverage(name).tolist(), strict=True)),
         seconds,
     )
 

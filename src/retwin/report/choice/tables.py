@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import isfinite
+from statistics import mean
 
 from retwin.evaluation.choice.fitted import Fitted
 from retwin.report.assets import sentences
@@ -47,13 +49,20 @@ def comparison_table(found: Fitted) -> Table:
                     ),
                     Cell(significant(each.crps), best=best),
                     Cell(significant(each.difference, size or each.crps), error),
-                    f"{each.coverage:.0%}",
+                    _coverage(each.coverage),
                     duration(each.seconds),
                 ]
             )
     heads = ["candidate", *(Column(name, "RMS error") for name in units)]
-    title = f"Errors of parts that were left out ({found.how}), the simplest candidate first"
+    title = "Errors of parts that were left out, the simplest candidate first"
     return tabulate(title, [*heads, "CRPS", "behind the best", "90 % bands hold", "time"], rows)
+
+
+def _coverage(shares: Mapping[str, float]) -> Cell:
+    """The mean share in the bands of the outputs, and that of each where there are several."""
+    known = {name: share for name, share in shares.items() if isfinite(share)}
+    own = ", ".join(f"{name} {share:.0%}" for name, share in known.items())
+    return Cell(f"{mean(known.values()):.0%}" if known else "–", own if len(known) > 1 else "")
 
 
 def parameter_table(found: Fitted) -> Table:
