@@ -504,7 +504,7 @@ def _event_rows(
 
 def _describe_event(record: str, begin: str, end: str, what: str, causes: Sequence[str]) -> str:
     """An event as lines: when and what, and its causes."""
-    until = ", which lasts" if end == "lasts" else f" until it was over or hidden at {end} s"
+    until = ", which lasts" if end == "lasts" else f", no longer seen from {end} s"
     return "\n    ".join([f"{record}, from {begin} s{until}: {what}", *causes])
 
 

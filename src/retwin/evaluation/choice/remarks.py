@@ -269,5 +269,5 @@ def without_twin(
     return [
         f"The {best.title} predicts the same parts better by {gain:.0%}: the twin lacks something "
         "that the commands determine. Add that to the twin; where its parameters need no meaning, "
-        f"take the other model: `retwin.update.fit_black_box(records, {best.name!r})`."
+        f"take the other model, in Python: `retwin.update.fit_black_box(records, {best.name!r})`."
     ]
