@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from retwin._lazy import names
+from retwin.checks import needs_extra
+
+needs_extra("fastapi", "monitor", "answers requests")  # which the modules import by its name
 
 _HOME = {"create_app": "app", "listening": "serve", "serving": "serve"}
 
