@@ -182,7 +182,10 @@ def _carry_out(
         )
         found.save(out, page=fit_page(found, str(out), title=system.title))
         if yardstick:
-            note(f"Saved {out}; now models without the twin, to be compared with")
+            note(
+                f"Saved {out}; now models without the twin, to compare it with, which may take "
+                "longer: Ctrl-C ends that and keeps it, --no-yardstick leaves that out"
+            )
             try:
                 found = with_yardstick(
                     found,
