@@ -9,6 +9,7 @@ import shutil
 import signal
 import sys
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
@@ -124,6 +125,23 @@ def test_alarms_and_causes_are_lines_and_a_changed_monitor_is_proposed(
         assert [each.state for each in Registry(store, "tank").versions()] == ["active", "proposed"]
         stored = sum(len(times) for times, _ in store.samples("tank1"))
     assert stored == 340
+
+
+@pytest.mark.slow
+def test_a_page_without_a_token_is_read_only(
+    place: Path, watching, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RETWIN_MONITOR_TOKEN", raising=False)
+    (place / "monitor.toml").write_text(SETTINGS + "[server]\nport = 0\n")
+    running = watching(place)
+    running.wait(lambda: "watching" in running.out())
+    (page,) = re.findall("page: (.*) [(]read only", running.out())
+    assert json.loads(urllib.request.urlopen(page + "assets").read())
+    for token in ("", "Bearer ", "Bearer None"):
+        asked = urllib.request.Request(page + "samples", b"{}", {"Authorization": token})
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            urllib.request.urlopen(asked)
+    stopped(running)
 
 
 @pytest.mark.slow

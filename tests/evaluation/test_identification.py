@@ -185,7 +185,9 @@ def test_an_interval_that_leaves_a_positive_range_is_named() -> None:
     assert checked.open_parameters == ("coupling",)
     assert state(coupling) == "not identified: its interval reaches an end of its range"
     texts = findings(checked)
-    assert any("it reaches 0, at which its range begins" in each.replace("\n", " ") for each in texts)
+    assert any(
+        "it reaches 0, at which its range begins" in each.replace("\n", " ") for each in texts
+    )
     assert not any("do not determine" in each for each in texts)
 
 

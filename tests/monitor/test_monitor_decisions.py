@@ -492,7 +492,10 @@ def test_a_size_at_an_end_of_its_range_is_told() -> None:
     none = replace(LEAK, size=(0.0, 1.0))  # no change is the end of the fault, and not of its range
     assert not cause._at_limit(none, (0.1, 0.0, 0.2))
     data = cause_data("leak", 0.9, 0.1, {}, (0.9, 0.8, 1.0), "m2") | {"limit": True}
-    assert "(0.8 to 1) at the end of its range, probability" in cause_text(data, "")
+    assert (
+        "(0.8 to 1) at the end of its range, so that it may be something else, prob"
+        in cause_text(data, "")
+    )
 
 
 def found_cause(

@@ -575,7 +575,8 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     if events and poisson.sf(events - 1, samples / monitor.run_length) < monitor.alpha:
         text += (
             " These are more events than it allows: faults; or, if you know that the machine was "
-            "healthy, the promise does not hold for it, so calibrate with these records too."
+            "healthy, the promise does not hold for it. Calibrate with these records too; if it "
+            "then sees less (the table of monitor fit), the twin lacks what happens in them."
         )
     return text
 
@@ -587,7 +588,11 @@ def _describe_promise(monitor: Monitor) -> str:
     known = monitor.tried.kept(monitor.arl)
     source = "the model of the noise" if known else "the events of records that were left out"
     wanted = duration(monitor.run_length / monitor.twin.rate)
-    return f"The promise of at most one false event in {wanted} follows from {source}."
+    alone = duration(monitor.tried.run_length / monitor.twin.rate)
+    return (
+        f"The promise of at most one false event in {wanted} follows from {source}; the records "
+        f"of the calibration alone bound them at one in {alone}."
+    )
 
 
 def _json(file: Path, record: Trajectories, watched: Watched, causes: list[Cause]) -> dict:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import secrets
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -22,6 +24,7 @@ from retwin.monitor.models.trajectory.monitor import TrajectoryMonitor
 from retwin.monitor.server import create_app, listening, serving
 from retwin.monitor.server.app import check_token
 from retwin.monitor.settings import (
+    TOKEN,
     FolderSource,
     MonitorSettings,
     MqttSource,
@@ -65,8 +68,10 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
     """
     with ExitStack() as opened:
         page = settings.server
-        what = "token, of 16 characters at least"
-        token = check_token(secret(what, page.token_env, page.token_file)) if page else ""
+        shared = page and secret("token", page.token_env, page.token_file)
+        shared = shared or os.environ.get(TOKEN)
+        # Without one, nobody has the token of this start.
+        token = check_token(shared) if shared else secrets.token_urlsafe()
         bound = page and opened.enter_context(listening(page.host, page.port))
         for twin in settings.twins.values():
             load_monitor(twin.monitor)
@@ -101,7 +106,8 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
             )
             opened.enter_context(serving(app, bound))
             host, port = bound.getsockname()[:2]
-            report(f"page: http://{f'[{host}]' if ':' in host else host}:{port}/")
+            only = "" if shared else f" (read only, since the variable {TOKEN} holds no token)"
+            report(f"page: http://{f'[{host}]' if ':' in host else host}:{port}/{only}")
         for each in sources:
             thread = threading.Thread(target=each.keep_running, args=(gate, stop), name=each.name)
             thread.start()

@@ -150,6 +150,10 @@ class OpcUaSource(Part):
         return self
 
 
+TOKEN = "RETWIN_MONITOR_TOKEN"
+"""The variable of the environment with the token, where no other is named."""
+
+
 class ServerSettings(Part):
     """The page and the interface for other programs."""
 
@@ -159,8 +163,9 @@ class ServerSettings(Part):
     """Its port; 0 for any that is free."""
     hosts: list[str] = Field(default=[])
     """Names of this machine by which others reach it, where it listens on more than loopback."""
-    token_env: str = "RETWIN_MONITOR_TOKEN"
-    """Variable of the environment with the token that writing needs."""
+    token_env: str | None = None
+    """Variable of the environment with the token that writing needs; by default
+    RETWIN_MONITOR_TOKEN, without which the page is read only."""
     token_file: Beside | None = None
     """File with the token instead."""
 

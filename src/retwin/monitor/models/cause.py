@@ -114,7 +114,7 @@ def cause_text(cause: Mapping[str, Any], since: str) -> str:
     text += ", and more than that" if since and more else ""
     value, low, high = cause["size"]
     of = f" {cause['unit']}" if cause["unit"] not in ("", "1") else ""
-    end = " at the end of its range" if cause["limit"] else ""
+    end = " at the end of its range, so that it may be something else" if cause["limit"] else ""
     sized = value is not None and np.isfinite(value)
     size = f"size {value:.3g}{of} ({low:.3g} to {high:.3g}){end}, " if sized else ""
     among = " among the known causes" if more else ""
