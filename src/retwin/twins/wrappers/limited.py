@@ -74,9 +74,13 @@ def _limited_output(output: Callable[..., Any], limits: NDArray) -> Callable[...
 
     def read(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
         made = every(x, u, p)
-        values = made if isinstance(made, tuple | list) else (made,)
+        if isinstance(made, torch.Tensor):
+            made = made.unbind() if made.ndim else [made]
+        values = made if isinstance(made, Sequence) else [made]
         return tuple(
-            torch.clamp(value, *ends) if np.isfinite(ends).any() else value
+            value.clamp(*ends)
+            if isinstance(value, torch.Tensor) and np.isfinite(ends).any()
+            else value
             for value, ends in zip(values, limits.T.tolist(), strict=True)
         )
 
