@@ -253,7 +253,8 @@ def calibrate_forecasts(
     rows = [[_calibrate(pairs, channel) for channel in channels] for pairs in errors]
     persistence, deviation, independent, correlation = np.moveaxis(np.array(rows), 2, 0)
     memory = float(FORGOTTEN * correlation[-1].max() / records.rate)
-    held = [each.excess for each in found if _hold(each, deviation[-1])]
+    started = _calibrate_started(inner)
+    held = [each.excess for each in found if _hold_all(each, deviation[-1], started)]
     beyond = np.maximum(BEYOND, np.max([0.0 * found[0].excess, *held], axis=0))
     times = np.append(np.array(leads) / records.rate, np.inf)
     known, free = [values_of(records)], [each for each, _ in errors[-1]]
@@ -266,9 +267,7 @@ def calibrate_forecasts(
     by_lead = times, persistence, deviation, independent
     longest = float(records.lengths.max() / records.rate)
     drifts = errors_drift(np.concatenate(free))
-    return ForecastErrors(
-        *by_lead, memory, low, high, beyond, longest, drifts, _calibrate_started(inner)
-    )
+    return ForecastErrors(*by_lead, memory, low, high, beyond, longest, drifts, started)
 
 
 def _calibrate_started(found: Sequence[LeftOut]) -> NDArray | None:
@@ -318,6 +317,16 @@ def _errors(part: LeftOut, i: int) -> tuple[NDArray, NDArray]:
         mean, last = part.ahead.mean[i], part.ahead.last[i]
     seen = part.record.mask & part.held[..., None] & np.isfinite(mean)
     return np.where(seen, part.record.observed - mean, np.nan), np.where(seen, last, 0.0)
+
+
+def _hold_all(part: LeftOut, deviation: NDArray, started: NDArray | None) -> bool:
+    """Whether bands of free simulation hold, and those from starts that the record gives."""
+    if not _hold(part, deviation):
+        return False
+    if part.started is None or started is None:
+        return True
+    known = part.held & np.isfinite(part.started).all(axis=2)
+    return _hold(replace(part, free=part.started, held=known), started)
 
 
 def _hold(part: LeftOut, deviation: NDArray) -> bool:
