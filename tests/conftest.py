@@ -9,11 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.nets.mixtures import FLOOR
 from retwin.nets.training import Training
+
+# A machine that is busy is no failure.
+settings.register_profile("any time", deadline=None)
+settings.load_profile("any time")
 
 FIRST = (
     "study/test_study.py",
