@@ -35,8 +35,8 @@ from retwin.evaluation.choice.trials import Trials, shorter, unstable
 from retwin.progress import Progress
 from retwin.scores.distributions import crps_normal
 from retwin.twins.twin import Twin, check_channels
-from retwin.twins.wrappers.limited import describe_limits, with_limits
 from retwin.twins.wrappers.parametric import ParametricTwin
+from retwin.twins.wrappers.sensor_limits import describe_limits, limit_equations
 from retwin.update.agreement import check_with_twin
 from retwin.update.blackbox import BLACK_BOXES, fit_black_box
 from retwin.update.corrected import CorrectedTwin
@@ -126,7 +126,9 @@ def fit(
     others = other_machines(settings.prior, settings.correction or DelayOffset(), twin)
     checked = check_with_twin(original or twin, given_records)
     limits = limits_of(records)
-    twin = with_limits(twin, limits)
+    twin = limit_equations(twin, limits)
+    told = describe_limits(twin.outputs.names, limits) if state_names(twin) else ""
+    limit_remarks = [f"{told}."] if told else []
     shown = None if settings.compared else progress
     whole = Candidates(twin, records, settings, seed, case, original, shown)
     names = _names(whole, settings)
@@ -135,7 +137,7 @@ def fit(
     given = whole.fits[settings.method]() if settings.method else None
     if given is not None and not settings.compared:
         alone = _fit_alone(whole, given, time.process_time() - since, began, checked)
-        return replace(alone, remarks=(*alone.remarks, *_of_prior(given, others)))
+        return replace(alone, remarks=(*alone.remarks, *limit_remarks, *_of_prior(given, others)))
     folds = folds_of(records)
     trials = _run_trials(whole, folds, names, progress)
     free, reasons, horizon = _compare(trials, whole)
@@ -151,10 +153,7 @@ def fit(
         _row(name, comparison, differences, trials.seconds[name], reasons.get(name, ""))
         for name in trials.names
     )
-    remarks = remarks_of(records, comparison, scores, chosen, preferred, horizon)
-    if state_names(twin):
-        text = describe_limits(twin.outputs.names, limits)
-        remarks = (*remarks, *([f"{text}."] if text else []))
+    remarks = (*remarks_of(records, comparison, scores, chosen, preferred, horizon), *limit_remarks)
     if settings.identified and "none" not in names and "parameters" in names:
         remarks = (*remarks, IDENTIFIED)
     if horizon != settings.horizon:

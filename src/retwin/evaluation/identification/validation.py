@@ -21,8 +21,8 @@ from retwin.evaluation.identification.residual_tests import ResidualTest, residu
 from retwin.scores.intervals import MIN_GROUPS, jackknife_interval
 from retwin.scores.residuals import decorrelated_after
 from retwin.twins.twin import checked_stride
-from retwin.twins.wrappers.limited import limited
 from retwin.twins.wrappers.parametric import ParametricTwin
+from retwin.twins.wrappers.sensor_limits import limit_outputs
 from retwin.update.dynamics.windows import simulated as simulated_outputs
 from retwin.update.forecasts import BEGIN
 from retwin.update.identification.horizon import predictions
@@ -229,7 +229,7 @@ def validate_identification(
         parts["validation"] = held_out
     simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]] = {}
     limits = limits_of(used)
-    twins = limited(before, limits), limited(mean, limits)
+    twins = limit_outputs(before, limits), limit_outputs(mean, limits)
     for part, measured in parts.items():
         checked_stride(before, measured, None, part)
         own = isinstance(found, Updated) and bool(found.own_starts)

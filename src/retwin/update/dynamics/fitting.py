@@ -21,8 +21,8 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
-from retwin.twins.wrappers.limited import describe_limits, with_limits
 from retwin.twins.wrappers.parametric import ParametricTwin
+from retwin.twins.wrappers.sensor_limits import describe_limits, limit_equations
 from retwin.update.dynamics.between_samples import chosen
 from retwin.update.dynamics.discrepancy.domain import Domain
 from retwin.update.dynamics.discrepancy.equations import CorrectedEquations
@@ -158,7 +158,7 @@ def fit_dynamics(
     base, free, values = state_twin_of(twin)
     checked_stride(base, observed, None, "observed")
     limits = limits_of(observed)
-    base = with_limits(base, limits)
+    base = limit_equations(base, limits)
     once = distinct_records(np.where(observed.mask, observed.observed, np.nan))
     copies = len(observed) - len(once)
     again = f"{copies} of {len(observed)} trajectories are copies and count once" * bool(copies)

@@ -21,8 +21,8 @@ from retwin.data.quality.sensors import limits_of
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.wrappers.limited import describe_limits, limited
 from retwin.twins.wrappers.parametric import ParametricTwin
+from retwin.twins.wrappers.sensor_limits import describe_limits, limit_outputs
 from retwin.update.dynamics.windows import state_based
 from retwin.update.identification.bayes import infer_posterior
 from retwin.update.identification.horizon import (
@@ -235,7 +235,7 @@ def identify(
     limits, read = np.array([]), twin
     if isinstance(twin, ParametricTwin) and isinstance(observed, Trajectories):
         limits = limits_of(observed)
-        read = limited(twin, limits)
+        read = limit_outputs(twin, limits)
     begin = partial(misfit_of, seed=seed, rate=rate, processes=processes)
     if isinstance(method, MCMC | NPE):
         with begin(read, observed) as misfit:

@@ -12,7 +12,7 @@ from retwin.checks import one_of, whole
 from retwin.data.measured import measured_only
 from retwin.data.quality.sensors import limits_of
 from retwin.data.trajectories import Trajectories
-from retwin.twins.wrappers.limited import limited
+from retwin.twins.wrappers.sensor_limits import limit_outputs
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.misfit import misfit_of
 from retwin.update.identification.search import LeastSquares, Search
@@ -107,7 +107,7 @@ def profile(
     if np.isfinite(updated.errors[name]):
         error = updated.errors[name]
         limit = stats.t.ppf(0.975, len(observed) - 1) ** 2
-    read = limited(updated.twin, limits_of(observed))
+    read = limit_outputs(updated.twin, limits_of(observed))
     begin = misfit_of(read, observed, seed=0, rate=rate, processes=processes, own=own)
     with begin as misfit:
         search = Search(misfit, LeastSquares(starts=1), None)

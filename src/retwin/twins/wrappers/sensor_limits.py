@@ -17,7 +17,7 @@ from retwin.twins.wrappers.wrapper import TwinWrapper
 TwinType = TypeVar("TwinType")
 
 
-def limited(twin: ParametricTwin, limits: NDArray) -> ParametricTwin:
+def limit_outputs(twin: ParametricTwin, limits: NDArray) -> ParametricTwin:
     """The same twin, whose outputs count as the limit where they are beyond it.
 
     Parameters
@@ -29,11 +29,11 @@ def limited(twin: ParametricTwin, limits: NDArray) -> ParametricTwin:
 
     """
     if isinstance(twin.twin, StateTwin) or not np.isfinite(limits).any():
-        return with_limits(twin, limits)
+        return limit_equations(twin, limits)
     return replace(twin, twin=_LimitedTwin(twin.twin, limits))
 
 
-def with_limits(twin: TwinType, limits: NDArray) -> TwinType:
+def limit_equations(twin: TwinType, limits: NDArray) -> TwinType:
     """State equations, alone or with their free parameters, whose outputs have limits (2, d_y).
 
     Derivatives are exact, and they can be saved. Any other twin is returned as it is.
@@ -44,7 +44,7 @@ def with_limits(twin: TwinType, limits: NDArray) -> TwinType:
     if isinstance(twin, StateTwin):
         made = replace(twin, output=_limited_output(twin.output, limits))
     elif isinstance(twin, ParametricTwin):
-        made = replace(twin, twin=with_limits(twin.twin, limits))
+        made = replace(twin, twin=limit_equations(twin.twin, limits))
     return made
 
 
