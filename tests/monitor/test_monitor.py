@@ -64,6 +64,15 @@ def monitor(twin: DynamicsTwin) -> Monitor:
     return fit_monitor(twin, record(2, 1), "1 per hour")
 
 
+def test_a_record_that_the_twin_does_not_follow_is_named(twin: DynamicsTwin) -> None:
+    faults = [None, ParameterShift("drain", size=1.3, onset=12.0), None]
+    named = r"in 00001 errors of (level|pressure) are .* the largest of .*, from 1[0-9.]+ s to"
+    with pytest.warns(UserWarning, match=named) as given:
+        fit_monitor(twin, record(3, 7, steps=240, faults=faults), "1 per hour")
+    assert len([each for each in given if "errors of" in str(each.message)]) == 1
+    fit_monitor(twin, record(3, 7, steps=240), "1 per hour")  # warnings are errors
+
+
 def leaking(seed: int = 5) -> rt.Trajectories:
     """Three machines of which the second one leaks from 30 s on, without some samples."""
     leak = ParameterShift("drain", size=1.3, onset=30.0)

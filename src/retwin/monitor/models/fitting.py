@@ -47,6 +47,9 @@ EFFECTS = (1.0, 3.0, 10.0)
 the largest density of the calibration is taken, each sample predicted from those before."""
 LARGEST_VARIANCE = 10.0
 """Mean square of standardised errors up to which a slower model describes the machine."""
+LARGER_ERRORS = 3.0
+"""Times the other records' largest errors, as root mean squares of short parts, from which on those
+of a record are named."""
 FOLDS = 8
 """Parts of the calibration that are left out in turn, at most."""
 
@@ -110,6 +113,8 @@ def fit_monitor(
     calibrated = partial(_calibrated, twin, healthy, measured, steps)
     first = given("healthy", calibrated(Predictor()), expected, got="others", remedy=remedy)
     found = [first, *_slower(twin, healthy.steps, calibrated)]
+    for note in _badly_followed(healthy, np.concatenate([each.error for each in found], axis=2)):
+        warnings.warn(f"healthy: {note}", stacklevel=2)
     error, width = (_joined([getattr(each, of) for each in found]) for of in ("error", "width"))
     names, folds = _folds(healthy, np.isfinite(error).all(axis=0))
     disturbance = fit_disturbance(error, folds=folds)
@@ -185,6 +190,41 @@ def _calibrated(
     noted = features(*before, given[0], mean, span_of(twin))[1]
     known = replace(model, warm_up=warm_up / twin.rate, effect=effect)
     return _Calibrated(known, *errors, noted)
+
+
+def _badly_followed(healthy: Trajectories, error: NDArray) -> list[str]:
+    """What to say of records that the twin follows much worse than most of the others, for a time.
+
+    Parameters
+    ----------
+    healthy : Trajectories
+        The calibration; nothing is said of fewer than three records.
+    error : NDArray
+        (n, T, S), standardised errors of the predictions of each model and output.
+
+    """
+    count, samples, streams = error.shape
+    if count < 3:
+        return []
+    length = max(1, int(np.sqrt(samples)))
+    parts = error[:, : samples // length * length].reshape(count, -1, length, streams)
+    seen = np.isfinite(parts).sum(axis=2)
+    squares = np.nansum(parts**2, axis=2) / np.maximum(seen, 1)
+    size = np.sqrt(np.where(seen > length / 2, squares, 0.0))
+    largest = size.max(axis=1)
+    ratio = largest / np.maximum(np.median(largest, axis=0), 1.0)
+    made = []
+    for i in np.flatnonzero(ratio.max(axis=1) >= LARGER_ERRORS):
+        stream = int(ratio[i].argmax())
+        begin = int(size[i, :, stream].argmax()) * length / healthy.rate
+        made.append(
+            f"in {healthy.ids[i]} errors of {healthy.outputs.names[stream % len(healthy.outputs)]} "
+            f"are {ratio[i, stream]:.2g} times the largest of most other records, from "
+            f"{begin:.3g} s to {begin + length / healthy.rate:.3g} s. The monitor takes what it is "
+            "calibrated on for healthy, so it sees no fault that is smaller: fit the twin to "
+            "records like this one, or leave it out, after which such times raise alarms"
+        )
+    return made
 
 
 def _joined(values: Sequence[NDArray]) -> NDArray:
