@@ -234,20 +234,22 @@ def test_what_is_no_monitor_is_refused(watched: Path, call) -> None:
 
 
 @pytest.mark.slow
-def test_a_model_without_state_equations_is_watched_by_a_black_box(
-    watched: Path, call, tmp_path: Path
+@pytest.mark.parametrize("equations", [True, False])
+def test_equations_that_are_not_corrected_are_watched_and_else_a_black_box(
+    watched: Path, call, tmp_path: Path, *, equations: bool
 ) -> None:
     case, healthy = watched / "case.toml", watched / "healthy.npz"
     given = (case, "--real", healthy, "--correction", "additive", "--no-compare")
-    code, _, err = call("fit", *given, "--out", tmp_path / "model")
+    surrogate = ("--surrogate", "off" if equations else "on")  # a network has no equations
+    code, _, err = call("fit", *given, *surrogate, "--out", tmp_path / "model")
     assert code == 0, err
     out = tmp_path / "watch"
     code, printed, err = call("monitor", "fit", tmp_path / "model", healthy, "--out", out)
     assert code == 0, err
     words = " ".join(printed.split())
-    assert "model corrects no state equations" in words
-    assert "causes are channels" in words
-    assert "and fit --dynamics, the twin itself is watched" in words
+    assert ("model corrects no state equations: those of the twin" in words) == equations
+    assert ("has no state equations" in words and "causes are channels" in words) != equations
+    assert ("leaking: seen" in words) == equations
     code, printed, err = call("monitor", "replay", out, watched / "leak.npz")
     assert code == 0, err
     assert "1 event" in printed

@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import partial
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -53,8 +53,8 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.update import CorrectedTwin, DynamicsTwin
 
 EQUATIONS = (
-    "With state equations (a StateTwin, docs/twins.md#states) and fit --dynamics, the twin itself "
-    "is watched, and causes are its parameters too."
+    "With state equations (a StateTwin, docs/twins.md#states) the twin itself is watched, and "
+    "causes are its parameters too."
 )
 """What would watch the twin itself, where a black box takes its place."""
 FEW = 6
@@ -91,11 +91,12 @@ def fit(
 ) -> None:
     """Calibrate a monitor on healthy records, best not those that MODEL was fitted to.
 
-    Without MODEL, or with one whose outputs are corrected, a black box of the
+    Without MODEL, or with one that has no state equations, a black box of the
     records takes the place of a twin.
     """
     from retwin.monitor import fit_monitor, possible_causes, visible_sizes
-    from retwin.update import load_twin
+    from retwin.monitor.models.fitting import estimate_noise
+    from retwin.update import DynamicsTwin, load_twin
     from retwin.update.agreement import check_with_twin
 
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
@@ -110,7 +111,7 @@ def fit(
         _fit_trajectories(model, healthy, out, false_alarms, case, reading, as_json)
         return
     updated = load_twin(model) if model else None
-    known = _dynamics_of(updated)
+    equations = _equations_of(updated)
     system = case_named(case or (updated.case if updated else None) or None)
     tables = all(each.suffix.lower() == ".csv" for each in healthy)
     if updated is None and system is None and mapping is None and tables:
@@ -121,6 +122,8 @@ def fit(
     with bar("calibrate") as show:
         show("monitor", 0.0)
         given = Trajectories.concatenate(records)
+        corrected = equations is None or isinstance(equations, DynamicsTwin)
+        known = equations if corrected else estimate_noise(equations, given)
         checked = check_with_twin(known, given)
         more = {} if lasting is None else {"lasting": lasting}
         made = fit_monitor(known, given, false_alarms, **more)
@@ -136,7 +139,12 @@ def fit(
     hours = given.mask.any(axis=2).sum() / twin.rate / 3600
     box = f"No twin: a black box, calibrated on {hours:.3g} h of your data; causes are channels."
     if updated:
-        box = f"{model} corrects no state equations, which alone are followed. {box} {EQUATIONS}"
+        box = f"{model} has no state equations, which alone are followed. {box} {EQUATIONS}"
+    if not corrected:
+        box = (
+            f"{model} corrects no state equations: those of the twin are followed as they are, "
+            "with noise as in these records."
+        )
     promises = {name: str(each) for name, each in made.promises.items()}
     tried = made.tried.text(twin.rate)
     about = {"arl": made.arl, "run_length": made.run_length, "warm_up": made.warm_up}
@@ -144,8 +152,8 @@ def fit(
         {"saved": str(out), **about, "promises": promises, "tried": vars(made.tried)}
         | {"records": checked.values, "visible": [vars(each) for each in made.visible]},
         *shown_records(checked),
-        *([] if known else [box]),
-        *fitted_remarks(known and model, given, "the promise may not hold for new ones"),
+        *([] if known and corrected else [box]),
+        *fitted_remarks(model if known else None, given, "the promise may not hold for new ones"),
         _describe_promise(made),
         f"Tried: {tried}",
         *(f"{name}: {text}" for name, text in promises.items()),
@@ -406,15 +414,16 @@ def recalibrate(
     answer(vars(version), text, as_json=as_json)
 
 
-def _dynamics_of(model: CorrectedTwin | DynamicsTwin | None) -> DynamicsTwin | None:
-    """What follows a machine sample by sample: a model with corrected state equations, or theirs.
+def _equations_of(model: CorrectedTwin | DynamicsTwin | None) -> Any:
+    """What follows a machine sample by sample: corrected state equations, or those of the twin.
 
-    A residual of outputs after them is no part of it.
+    A residual of outputs after them is no part of it. None where there are no state equations.
     """
     from retwin.update import DynamicsTwin
+    from retwin.update.dynamics import state_names
 
-    inner = getattr(getattr(model, "surrogate", None), "twin", model)
-    return inner if isinstance(inner, DynamicsTwin) else None
+    inner: Any = getattr(getattr(model, "surrogate", None), "twin", model)
+    return inner if isinstance(inner, DynamicsTwin) or state_names(inner) else None
 
 
 def _named(twin: CorrectedTwin | DynamicsTwin | None) -> TwinData | None:

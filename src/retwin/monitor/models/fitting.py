@@ -32,12 +32,17 @@ from retwin.monitor.detect.promise import Tried, false_alarms
 from retwin.monitor.detect.scores import fit_scores, resolution
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.models.monitor import Monitor
+from retwin.progress import Progress
+from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import check_channels
+from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.blackbox import fit_black_box
 from retwin.update.blackbox.levels import fit_levels
+from retwin.update.dynamics import Dynamics, Library, fit_dynamics
 from retwin.update.dynamics.filter.online import with_main_directions
 from retwin.update.dynamics.filter.prediction import log_density
 from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.unknowns import state_names
 
 SEPARATION = 200
 """Missing samples that are put between two calibration records, so that neither predicts the
@@ -54,8 +59,16 @@ FOLDS = 8
 """Parts of the calibration that are left out in turn, at most."""
 
 
+def estimate_noise(
+    twin: StateTwin | ParametricTwin, healthy: Trajectories, progress: Progress | None = None
+) -> DynamicsTwin:
+    """State equations as they are, with the noise of states and sensors in healthy records."""
+    nothing = Dynamics(Library(0, (), False), held=True)  # no term, and parameters as they are
+    return fit_dynamics(twin, healthy, nothing, progress=progress).twin
+
+
 def fit_monitor(
-    twin: DynamicsTwin | None,
+    twin: DynamicsTwin | StateTwin | ParametricTwin | None,
     healthy: Trajectories,
     false_alarms_at_most: str | float = "1 per month",
     *,
@@ -66,9 +79,10 @@ def fit_monitor(
 
     Parameters
     ----------
-    twin : DynamicsTwin or None
-        The corrected twin, of `fit_dynamics`; None for a black box of these records, which is "arx"
-        where they have commands, and else a level of each output.
+    twin : DynamicsTwin, StateTwin, ParametricTwin or None
+        The corrected twin, of `fit_dynamics`; state equations, whose noise is that of these
+        records; or None for a black box of these records, which is "arx" where they have commands,
+        and else a level of each output.
     healthy : Trajectories
         Healthy records, best of several days, that the twin was not fitted to: the errors of those
         are smaller than of others, and the promise is that of these errors. Each is left out in
@@ -97,6 +111,8 @@ def fit_monitor(
     if twin is None:
         known = len(healthy.inputs) > 0
         model = fit_black_box(healthy, "arx").twin if known else fit_levels(healthy)
+    elif state_names(twin):
+        model = estimate_noise(twin, healthy)  # type: ignore[arg-type]
     twin = instance("twin", model, DynamicsTwin, remedy="fit it by fit_dynamics")
     check_channels(twin, healthy, "healthy")
     check_magnitude("healthy", healthy)

@@ -394,7 +394,7 @@ def estimate_starts(
     Raises
     ------
     InputError
-        Not one trajectory, nothing measured, or no unknown start.
+        Not one trajectory, nothing measured, no unknown start, or a simulation that diverges.
 
     """
     require(
@@ -407,6 +407,14 @@ def estimate_starts(
     given = np.ones(len(record.outputs)) if variance is None else variance
     own = Estimation(twin, record, unknowns, record.mask, given)
     found = own.linearised(Point(np.zeros(0), unknowns.start[None, unknowns.free]))
+    require(
+        bool(np.isfinite(found.products).all()),
+        "record",
+        expected="commands with which the simulation of the equations stays finite",
+        got=f"{record.ids[0]}, with which it diverges",
+        remedy="it leaves what the equations were corrected for: fit them to records like this "
+        "one, or take the twin with identified parameters alone",
+    )
     for i in range(1 if variance is not None else ROUNDS):
         if variance is None:
             own = replace(own, variance=own.power(found.residual) if i else own.spread)
