@@ -609,6 +609,20 @@ def test_a_twin_that_was_identified_by_the_records_is_judged_without_each_part()
     assert not any("have identified the parameters" in each for each in named.remarks)
 
 
+@pytest.mark.parametrize("forced", [True, False])
+def test_a_method_that_is_clearly_worse_is_taken_where_it_is_forced(*, forced: bool) -> None:
+    data, both = records(0, slope=right, steps=300), FAST[:2]
+    found = rt.fit(twin_of(), data, rt.Choice(both, "none", forced=forced))
+    assert found.preferred == "parameters"
+    assert found.chosen == ("none" if forced else "parameters")
+    said = (
+        "would have been taken" if forced else "The method that was asked for (the twin as it is)"
+    )
+    assert said in found.remarks[0]
+    wanted = rt.fit(twin_of(), data, rt.Choice(both, "parameters", forced=forced))
+    assert wanted.chosen == "parameters"
+
+
 def test_a_parameter_at_an_end_of_its_range_is_named() -> None:
     narrow = [replace(each, high=0.25, start=0.2) for each in twin_of().parameters[:1]]
     twin = replace(twin_of(), parameters=(*narrow, *twin_of().parameters[1:]))

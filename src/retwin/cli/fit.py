@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
 ModelFolder = Annotated[Path, option("FOLDER", "Where to save the updated twin.")]
 RealSet = Annotated[list[Path], option("FILE", "Real records; may be repeated.")]
-StateEquations = Annotated[bool, option("", "Correct the state equations.", "--dynamics")]
+StateEquations = Annotated[
+    bool, option("", "Correct the state equations, unless that is clearly worse.", "--dynamics")
+]
 Correction = Annotated[
     str | None,
     option("NAME", "additive, delay_offset or command_space.", names=catalog.CORRECTIONS),
@@ -83,7 +85,8 @@ def fit(
     """Update a twin by real records; save the updated twin.
 
     The simplest candidate is taken that predicts left-out parts of the records
-    best; or that of --dynamics, of --correction, or of a case with classes.
+    best; or that of --correction, or of a case with classes. --dynamics is taken
+    unless simpler candidates are clearly better.
     """
     import retwin as rt
     from retwin.deploy.identified import identified_by
@@ -134,6 +137,7 @@ def fit(
         rt.Choice.of(system),
         horizon=seconds,
         method=method,
+        forced=not dynamics or not compare,
         compare=compare,
         identified=identified_by(case, measured),
         calibrate_on=faults,

@@ -95,9 +95,9 @@ def fit(
     records takes the place of a twin.
     """
     from retwin.monitor import fit_monitor, possible_causes, visible_sizes
-    from retwin.monitor.models.fitting import estimate_noise
     from retwin.update import DynamicsTwin, load_twin
     from retwin.update.agreement import check_with_twin
+    from retwin.update.dynamics import estimate_noise
 
     reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     model = files[0] if files[0].is_dir() and (files[0] / "model.json").is_file() else None

@@ -265,7 +265,7 @@ class FaultEvidence:
         made = np.where(record.seen[..., None], made, 0.0)
         covariance = record.filtered(Variants(), more)[1]
         factor = root_of(covariance, record.seen[None])[0]
-        scaled = np.linalg.solve(factor, made).reshape(-1, made.shape[2])
+        scaled = np.linalg.solve(factor, made).reshape(made.shape[0] * made.shape[1], -1)
         if not np.isfinite(scaled).all():
             return made[..., :0]
         _, values, directions = np.linalg.svd(scaled, full_matrices=False)

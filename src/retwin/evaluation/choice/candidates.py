@@ -16,7 +16,13 @@ from retwin.twins.twin import Twin
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive, Correction, DelayOffset
-from retwin.update.dynamics import DynamicsTwin, FittedDynamics, fit_dynamics, state_names
+from retwin.update.dynamics import (
+    DynamicsTwin,
+    FittedDynamics,
+    estimate_noise,
+    fit_dynamics,
+    state_names,
+)
 from retwin.update.identification import LeastSquares, Updated, identify
 from retwin.update.residual import StationaryNoise, fit_residual
 
@@ -116,6 +122,11 @@ class Candidates:
     def dynamics(self) -> DynamicsTwin:
         """Corrected state equations."""
         return replace(self.learned.twin, case=self.case)
+
+    def uncorrected(self, name: str) -> DynamicsTwin:
+        """The state equations of "none" or "parameters", with noise of states and outputs."""
+        own = self.twin if name == "none" else self.identified
+        return replace(estimate_noise(own, self.records), case=self.case)  # type: ignore[arg-type]
 
     def none(self) -> CorrectedTwin:
         """The twin as it is, with its errors as noise."""

@@ -64,6 +64,12 @@ UNSTABLE = (
 )
 """What is said where candidates were judged over a shorter time than was asked for."""
 
+NOT_TAKEN = (
+    "The method that was asked for ({}) predicts left-out parts of the records clearly worse than: "
+    "{}, which was taken. --no-compare takes it all the same, and judges nothing."
+)
+"""What is said where the method that was asked for is not the one that is taken."""
+
 IDENTIFIED = (
     "These records have identified the parameters of the twin, so that none of them is new to it. "
     "In its place a twin is scored whose parameters are identified without the part left out."
@@ -147,8 +153,10 @@ def fit(
         if started.predicted and started.best < STARTED * free.best:
             comparison, reasons, begin = started, failed, trials.begin
     preferred, differences = comparison.simplest()
-    chosen = settings.method or preferred
-    model = _calibrate(given or whole.fits[chosen](), trials, chosen, free)
+    wanted = settings.method
+    excess, error = differences.get(wanted, (np.inf, 0.0))
+    chosen = wanted if wanted and (settings.forced or excess <= error) else preferred
+    model = _calibrate(_taken(whole, chosen, given), trials, chosen, free)
     scores = tuple(
         _row(name, comparison, differences, trials.seconds[name], reasons.get(name, ""))
         for name in trials.names
@@ -156,6 +164,9 @@ def fit(
     remarks = (*remarks_of(records, comparison, scores, chosen, preferred, horizon), *limit_remarks)
     if settings.identified and "none" not in names and "parameters" in names:
         remarks = (*remarks, IDENTIFIED)
+    if wanted and chosen != wanted:
+        titles = (CANDIDATES[each] for each in (wanted, chosen))
+        remarks = (NOT_TAKEN.format(*titles), *remarks)
     if horizon != settings.horizon:
         remarks = (UNSTABLE.format(horizon), *remarks)
     predicted, deviation = _predictions_of(comparison, chosen)
@@ -178,11 +189,21 @@ def fit(
         records=records,
         predicted=predicted,
         deviation=deviation,
-        learned=whole.learned if "learned" in vars(whole) else None,
+        learned=whole.learned if chosen.startswith("dynamics") else None,
         seconds=time.perf_counter() - began,
         checked=checked,
     )
     return with_yardstick(found, seed=seed) if settings.yardstick else found
+
+
+def _taken(whole: Candidates, chosen: str, given: Model | None) -> Model:
+    """The chosen candidate, fitted to all records; `given` is that of `settings.method`."""
+    wanted = whole.settings.method
+    if given is not None and chosen == wanted:
+        return given
+    if wanted == "dynamics" and chosen in ("none", "parameters"):
+        return whole.uncorrected(chosen)  # what is done with state equations works with it too
+    return whole.fits[chosen]()
 
 
 def _run_trials(

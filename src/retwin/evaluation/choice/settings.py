@@ -46,6 +46,8 @@ class Choice:
         that the twin and the records allow, and with a `method` those that are simpler than it.
     method : str
         The candidate that is taken whatever the comparison shows; by default the one that it shows.
+    forced : bool
+        Whether that is so also where another candidate is better by more than a standard error.
     horizon : float, optional
         Time in s over which predictions from measurements are judged; by default free simulation
         from the commands alone.
@@ -79,6 +81,7 @@ class Choice:
 
     candidates: Sequence[str] = ()
     method: str = ""
+    forced: bool = True
     horizon: float | None = None
     dynamics: Dynamics = Dynamics()  # noqa: RUF009 - frozen
     correction: Correction | None = None

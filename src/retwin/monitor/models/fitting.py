@@ -32,13 +32,12 @@ from retwin.monitor.detect.promise import Tried, false_alarms
 from retwin.monitor.detect.scores import fit_scores, resolution
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.models.monitor import Monitor
-from retwin.progress import Progress
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import check_channels
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.blackbox import fit_black_box
 from retwin.update.blackbox.levels import fit_levels
-from retwin.update.dynamics import Dynamics, Library, fit_dynamics
+from retwin.update.dynamics import estimate_noise
 from retwin.update.dynamics.filter.online import with_main_directions
 from retwin.update.dynamics.filter.prediction import log_density
 from retwin.update.dynamics.twin import DynamicsTwin
@@ -57,14 +56,6 @@ LARGER_ERRORS = 3.0
 of a record are named."""
 FOLDS = 8
 """Parts of the calibration that are left out in turn, at most."""
-
-
-def estimate_noise(
-    twin: StateTwin | ParametricTwin, healthy: Trajectories, progress: Progress | None = None
-) -> DynamicsTwin:
-    """State equations as they are, with the noise of states and sensors in healthy records."""
-    nothing = Dynamics(Library(0, (), False), held=True)  # no term, and parameters as they are
-    return fit_dynamics(twin, healthy, nothing, progress=progress).twin
 
 
 def fit_monitor(

@@ -11,6 +11,7 @@ from retwin.update.dynamics.filter.prediction import Prediction
 from retwin.update.dynamics.fitting import FittedDynamics, fit_dynamics
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.uncorrected import estimate_noise
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "Library",
     "Prediction",
     "TanhNetwork",
+    "estimate_noise",
     "fit_dynamics",
     "state_names",
     "state_twin_of",

@@ -104,13 +104,19 @@ def without_discrepancy(
     for _ in range(ERROR_STEPS):
         estimation = replace(estimation, variance=estimation.power(found.residual))
         found = estimation.minimised(_with_best_delays(estimation, found))
-    estimation = replace(estimation, variance=estimation.power(found.residual))
+    return hold_confounded(
+        replace(estimation, variance=estimation.power(found.residual)), found
+    ), found
+
+
+def hold_confounded(estimation: Estimation, found: Linearised) -> Estimation:
+    """The same with combinations of shared coordinates held of which the samples say nothing."""
     combinations, there = estimation.confounded(found) / HELD, found.point.shared
 
     def held(shared: NDArray) -> tuple[NDArray, NDArray]:
         return combinations @ (shared - there), combinations
 
-    return replace(estimation, absorbed=held if len(combinations) else None), found
+    return replace(estimation, absorbed=held if len(combinations) else None)
 
 
 def _with_best_delays(estimation: Estimation, found: Linearised) -> Linearised:
