@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,6 +72,18 @@ def test_a_record_that_the_twin_does_not_follow_is_named(twin: DynamicsTwin) -> 
         fit_monitor(twin, record(3, 7, steps=240, faults=faults), "1 per hour")
     assert len([each for each in given if "errors of" in str(each.message)]) == 1
     fit_monitor(twin, record(3, 7, steps=240), "1 per hour")  # warnings are errors
+
+
+def test_free_simulation_shows_what_changes(monitor: Monitor, tmp_path: Path) -> None:
+    monitor.save(tmp_path / "watch")
+    again = Monitor.load(tmp_path / "watch")
+    assert again.find_free_errors(record(2, 9)) == {}
+    slow = record(1, 9, faults=[ParameterDrift("drain", size=0.02, onset=20.0)])
+    found = again.find_free_errors(slow)
+    assert found == monitor.find_free_errors(slow)
+    first, largest, usual = found["level"]
+    assert (20 < first < 60, largest > 2 * usual, usual < 3 * NOISE) == (True, True, True)
+    assert replace(again, free=()).find_free_errors(slow) == {}  # it diverged in calibration
 
 
 def leaking(seed: int = 5) -> rt.Trajectories:

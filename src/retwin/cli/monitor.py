@@ -168,8 +168,8 @@ def fit(
 
 BLIND = (
     "this monitor sees no change of a parameter, or of the effect of a command, by less than all "
-    "of it: its filter follows them as disturbances. Compare free simulations of new records too: "
-    "retwin evaluate MODEL --real LOG"
+    "of it: its filter follows them as disturbances. What replay says of free simulation may show "
+    "them"
 )
 """What is said of a monitor that detects faults of sensors at most."""
 
@@ -207,7 +207,7 @@ def replay(
         {
             "arl": made.arl,
             "promises": {name: str(each) for name, each in made.promises.items()},
-            "records": [_json(*each) for each in found],
+            "records": [_json(made, *each) for each in found],
         },
         *rows,
         *(_summary(made, *each[:3]) for each in found),
@@ -550,12 +550,24 @@ def _summary(monitor: Monitor, file: Path, record: Trajectories, watched: Watche
         for name, (first, value, low, high) in monitor.find_excursions(record).items()
     ]
     if outputs:
-        text += (
-            f". Outputs leave the range of the calibration: {'; '.join(outputs)}. No alarm follows "
-            "from that alone, since the filter follows slow changes: compare a free simulation, "
-            "retwin evaluate MODEL --real LOG"
-        )
-    return text + "."
+        text += f". Outputs leave the range of the calibration: {'; '.join(outputs)}"
+    return f"{text}.{_describe_free(monitor, record)}"
+
+
+def _describe_free(monitor: Monitor, record: Trajectories) -> str:
+    """What free simulation shows of changes that the filter follows; empty for nothing."""
+    units = dict(zip(record.outputs.names, record.outputs.units, strict=True))
+    found = [
+        f"{name} is off by {largest:.3g} {units[name]}, at most {usual:.3g} in calibration (from "
+        f"{first:.6g} s)"
+        for name, (first, largest, usual) in monitor.find_free_errors(record).items()
+    ]
+    if not found:
+        return ""
+    return (
+        f" In free simulation {'; '.join(found)}: something has changed slowly, or the twin does "
+        "not hold here. The filter follows that, so it is no alarm and has no promise."
+    )
 
 
 def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> str:
@@ -604,7 +616,9 @@ def _describe_promise(monitor: Monitor) -> str:
     )
 
 
-def _json(file: Path, record: Trajectories, watched: Watched, causes: list[Cause]) -> dict:
+def _json(
+    monitor: Monitor, file: Path, record: Trajectories, watched: Watched, causes: list[Cause]
+) -> dict:
     alarms = [vars(each) | {} for each in watched.alarms]
     for alarm, cause in zip(alarms, causes, strict=False):
         alarm["cause"] = {name: value for name, value in vars(cause).items() if name != "alarm"}
@@ -615,5 +629,6 @@ def _json(file: Path, record: Trajectories, watched: Watched, causes: list[Cause
         "endings": [vars(each) for each in watched.endings],
         "void": [record.ids[i] for i, each in enumerate(watched.void) if each[-1]],
         "outside": [record.ids[i] for i, each in enumerate(watched.outside) if each],
+        "free_simulation": monitor.find_free_errors(record),
         "measured_samples": int(record.mask.any(axis=2).sum()),
     }

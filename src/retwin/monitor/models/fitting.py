@@ -31,6 +31,7 @@ from retwin.monitor.detect.predictors import (
 from retwin.monitor.detect.promise import Tried, false_alarms
 from retwin.monitor.detect.scores import fit_scores, resolution
 from retwin.monitor.detect.slack import Slack
+from retwin.monitor.models.free_simulation import free_errors, sizes_of_parts
 from retwin.monitor.models.monitor import Monitor
 from retwin.twins.equations.state_twin import StateTwin
 from retwin.twins.twin import check_channels
@@ -143,7 +144,9 @@ def fit_monitor(
     pairs = (dict(zip(names, each, strict=True)) for each in (events, counted))
     predictors = tuple(each.predictor for each in found)
     more = (noise, Tried(*pairs), lasting, float(alpha), predictors)
-    return Monitor(twin, disturbance, scores, slack, steps, arl, *more)
+    free = free_errors(twin, healthy)
+    largest = tuple(free[0].max(axis=(0, 1)).tolist()) if free else ()
+    return Monitor(twin, disturbance, scores, slack, steps, arl, *more, free=largest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,14 +213,9 @@ def _badly_followed(healthy: Trajectories, error: NDArray) -> list[str]:
         (n, T, S), standardised errors of the predictions of each model and output.
 
     """
-    count, samples, streams = error.shape
-    if count < 3:
+    if len(healthy) < 3:
         return []
-    length = max(1, int(np.sqrt(samples)))
-    parts = error[:, : samples // length * length].reshape(count, -1, length, streams)
-    seen = np.isfinite(parts).sum(axis=2)
-    squares = np.nansum(parts**2, axis=2) / np.maximum(seen, 1)
-    size = np.sqrt(np.where(seen > length / 2, squares, 0.0))
+    size, length = sizes_of_parts(error)
     largest = size.max(axis=1)
     ratio = largest / np.maximum(np.median(largest, axis=0), 1.0)
     made = []

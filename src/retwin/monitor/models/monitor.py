@@ -28,6 +28,7 @@ from retwin.monitor.detect.promise import Promise, Tried
 from retwin.monitor.detect.scores import ConformalScores, middle
 from retwin.monitor.detect.slack import Slack
 from retwin.monitor.detect.validity import Validity
+from retwin.monitor.models.free_simulation import free_errors
 from retwin.monitor.models.saved import DISTURBANCE, read_fields, write_fields
 from retwin.monitor.models.state import Alarm, Ending, MonitorState, Part, Visible, Watched
 from retwin.twins.twin import check_channels
@@ -37,6 +38,8 @@ from retwin.update.forecast_errors import range_excess
 
 FAR = 0.25
 """Share of the width of its range by which an output that leaves it is named."""
+FREE = 2.0
+"""Times the largest error of free simulation in calibration from which on a larger one is named."""
 SIZE = 256
 """Samples that are predicted at once: those after an alarm are predicted again. While an event
 lasts, where alarms are frequent, an eighth of them."""
@@ -79,6 +82,9 @@ class Monitor:
         The M predictive models.
     visible : tuple of Visible
         What is seen of faults, of `visible_sizes`; empty where that was not tried.
+    free : tuple of float
+        By output, the largest error of free simulation in calibration, see `free_errors`; empty
+        where it diverges.
 
     """
 
@@ -94,6 +100,7 @@ class Monitor:
     alpha: float = 0.01
     predictors: tuple[Predictor, ...] = (Predictor(),)
     visible: tuple[Visible, ...] = ()
+    free: tuple[float, ...] = ()
 
     @property
     def warm_up(self) -> float:
@@ -386,6 +393,31 @@ class Monitor:
                 ends = float(low[i]), float(high[i])
                 found[name] = (first, float(own[row, furthest]), *ends)
         return found
+
+    def find_free_errors(self, record: Trajectories) -> dict[str, tuple[float, float, float]]:
+        """Outputs that free simulation predicts much worse than in the calibration.
+
+        A fault that begins slowly, or has a small effect on each sample, is followed by the filter,
+        so that errors of one step do not show it. Another day may do the same: it is no alarm.
+
+        Returns
+        -------
+        dict of str to tuple of float
+            By output, the time in s from which on it is so, the largest error as a root mean square
+            of a part of the record, and that of the calibration.
+
+        """
+        found = free_errors(self.twin, record) if self.free else None
+        if found is None:
+            return {}
+        size, length = found[0].max(axis=0), found[1]
+        made = {}
+        for own, usual, name in zip(size.T, self.free, self.twin.outputs.names, strict=True):
+            beyond = own > FREE * usual
+            if beyond.any():
+                first = float(beyond.argmax()) * length / record.rate
+                made[name] = (first, float(own.max()), usual)
+        return made
 
     @cached_property
     def _filters(self) -> tuple[OnlineFilter, ...]:

@@ -37,6 +37,7 @@ def write_fields(folder: str | Path, fields: Mapping[str, Any]) -> None:
         "predictors": [[each.process, each.warm_up, each.effect] for each in predictors],
         "tried": vars(fields["tried"]),
         "visible": [vars(each) for each in fields["visible"]],
+        "free": fields["free"],
         **{name: fields[name] for name in NUMBERS},
     }
     arrays = {name: getattr(fields["disturbance"], name) for name in DISTURBANCE}
@@ -83,5 +84,6 @@ def read_fields(folder: str | Path) -> dict[str, Any]:
             "tried": Tried(**about["tried"]),
             "predictors": predictors,
             "visible": tuple(Visible(**each) for each in about["visible"]),
+            "free": tuple(finite("free", each, at_least=0.0) for each in about["free"]),
             **{name: finite(name, about[name], at_least=0.0) for name in NUMBERS},
         }
