@@ -50,6 +50,7 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
     from retwin.cases.twin_data import TwinData
     from retwin.monitor import Alarm, Cause, Monitor, Watched
+    from retwin.monitor.models.state import Visible
     from retwin.update import CorrectedTwin, DynamicsTwin
 
 EQUATIONS = (
@@ -61,6 +62,8 @@ FEW = 6
 """Faults that are listed, at most."""
 EARLIER = "before, by fewer samples: "
 """What stands before a cause in whose place another one was named later."""
+EXTRAPOLATED = "if it is a fault, and the twin holds there: "
+"""What stands before the cause of a remark."""
 CONFIG = Path("monitor.toml")
 Reading = Callable[..., Trajectories]
 """`cli.reading.read` with the options of the command."""
@@ -157,7 +160,7 @@ def fit(
         _describe_promise(made),
         f"Tried: {tried}",
         *(f"{name}: {text}" for name, text in promises.items()),
-        *map(str, made.visible),
+        *_describe_visible(made.visible),
         as_json=as_json,
     )
     changes = [each.hidden for each in made.visible if each.compared == "value" and each.value]
@@ -172,6 +175,15 @@ BLIND = (
     "them"
 )
 """What is said of a monitor that detects faults of sensors at most."""
+
+
+def _describe_visible(visible: Sequence[Visible]) -> list[str]:
+    """A line for each fault that is seen from some size on, and one for all others."""
+    from retwin.monitor.models.state import SHARE
+
+    hidden = [each.fault for each in visible if each.share < SHARE]
+    rest = f"Not seen at any size that was tried: {'; '.join(hidden)}"
+    return [*(str(each) for each in visible if each.share >= SHARE), *([rest] if hidden else [])]
 
 
 @app.command(epilog=example("retwin monitor replay watch day1.npz day2.npz"))
@@ -504,7 +516,7 @@ def _event_rows(
             again = f"again, or still, {times} until {begin} s, then {texts[0]}"
             rows[-1] = (*rows[-1][:2], until, rows[-1][3], [*shown, again])
         else:
-            further, prefix = 0, "" if first.promised else "if it is a fault: "
+            further, prefix = 0, "" if first.promised else EXTRAPOLATED
             shown = [(EARLIER if i else prefix) + each for i, each in enumerate(texts)]
             rows.append((first.trajectory, begin, until, what, shown))
         before = (first.trajectory, named[-1].name) if named else ("", "")
