@@ -21,6 +21,8 @@ LONGEST = 0.1
 STARTED, HARDLY = 0.8, 0.98
 """Ratios of errors from which starts of records are named, and a correction is said to be one of
 bands alone."""
+AHEAD = 20
+"""Samples ahead that are proposed where free simulation is worse than the mean."""
 WHITE, COLOURED = 0.01, 0.5
 """p-value below which errors are no white noise, and autocorrelation from which most of their mean
 square is none."""
@@ -130,7 +132,7 @@ def _worse_than_mean(records: Trajectories, score: CandidateScore, *, free: bool
     values = np.where(records.mask, records.observed, np.nan).astype(np.float64)
     spread = dict(zip(records.outputs.names, np.nanstd(values, axis=(0, 1)), strict=True))
     text = "; if the machine integrates, as a position does, judge predictions some time ahead: "
-    text = f"{text}--horizon 5s" if free else ""
+    text = f"{text}--horizon {AHEAD / records.rate:g}s" if free else ""
     return [
         f"{name} is predicted worse than by its mean over the records: the error is {error:.3g}, "
         f"the standard deviation {spread[name]:.3g}. Do not use this model for {name}{text}."
