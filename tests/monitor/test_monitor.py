@@ -86,6 +86,31 @@ def test_free_simulation_shows_what_changes(monitor: Monitor, tmp_path: Path) ->
     assert replace(again, free=()).find_free_errors(slow) == {}  # it diverged in calibration
 
 
+def test_nothing_is_promised_before_outputs_are_in_the_range_of_the_calibration(
+    monitor: Monitor,
+) -> None:
+    high = monitor.noise.high[-2:]
+    whole = record(2, 4)
+    assert monitor.find_begin(whole) == 0
+    # A machine that begins far above, with a fault: first a remark, and an event from 20 s on.
+    observed = whole.observed.copy()
+    observed[1, :200] = 3 * high
+    observed[1, 200:220] = whole.observed[1, 200:220]
+    observed[1, 220:, 0] += 0.5
+    begun = whole.replace(observed=observed)
+    assert monitor.find_begin(begun) == 20.0
+    found = monitor.watch(begun).events
+    assert {each.trajectory for each in found} == {begun.ids[1]}
+    assert [each.promised for each in found] == [each.time >= 20 for each in found]
+    assert {each.promised for each in found} == {True, False}
+    state, measured = monitor.start(2), begun.measured
+    for part in np.split(np.arange(600), [1, 150, 201]):
+        state, _ = monitor.step(state, begun.commands[:, part], measured[:, part], begun.ids)
+    assert (state.entered == 2).all()
+    again = MonitorState.of_arrays(state.arrays())
+    np.testing.assert_array_equal(again.entered, state.entered)
+
+
 def leaking(seed: int = 5) -> rt.Trajectories:
     """Three machines of which the second one leaks from 30 s on, without some samples."""
     leak = ParameterShift("drain", size=1.3, onset=30.0)
@@ -288,7 +313,7 @@ def test_other_channels_and_too_few_samples_are_refused(
     with pytest.raises(InputError, match="longer"):
         fit_monitor(twin, record(1, 0, steps=40))
     with pytest.raises(InputError, match="fit_dynamics"):
-        fit_monitor(TANK, record(1, 0))  # type: ignore[arg-type]
+        fit_monitor(monitor, record(1, 0))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

@@ -557,6 +557,12 @@ def _summary(monitor: Monitor, file: Path, record: Trajectories, watched: Watche
             f"; in {int(watched.outside.sum())} of {len(record)} records commands leave the range "
             "of the calibration, where the twin extrapolates and nothing is promised"
         )
+    begin = monitor.find_begin(record)
+    if begin:
+        text += (
+            f"; until {begin:.6g} s outputs are outside of the range of the calibration, in states "
+            "of which nothing is promised"
+        )
     outputs = [
         f"{name}, {low:.4g} to {high:.4g} there, reaches {value:.4g} (outside from {first:.6g} s)"
         for name, (first, value, low, high) in monitor.find_excursions(record).items()

@@ -34,7 +34,7 @@ from retwin.monitor.models.state import Alarm, Ending, MonitorState, Part, Visib
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.filter.online import OnlineFilter
 from retwin.update.dynamics.twin import BEYOND, DynamicsTwin
-from retwin.update.forecast_errors import range_excess
+from retwin.update.forecast_errors import channel_excess, range_excess
 
 FAR = 0.25
 """Share of the width of its range by which an output that leaves it is named."""
@@ -131,6 +131,7 @@ class Monitor:
             np.zeros((count, len(DECAYS), len(self.twin.inputs))),
             np.zeros((count * len(self.slack), 2)),
             np.zeros(count, dtype=bool),
+            np.zeros((count, len(self.twin.outputs)), dtype=np.int64),
         )
 
     def step(
@@ -247,7 +248,8 @@ class Monitor:
                 learn[:, None], end_evidence, validity.detector.evidence_of_end(*given, low, high)
             )
         ended = rules.ends(state.course, total, end_evidence, counted) & ~alarm
-        outside = self._outside(commands)
+        entered = self._entered(state.entered, measured)
+        outside = self._outside(commands) | (entered == 1).any(axis=2)
         changed = rules.changes(state.course, samples) & ~ended
         stays_finite = np.all([np.isfinite(each).all(axis=(1, 2)) for each in means], axis=0)
         after = replace(
@@ -258,6 +260,7 @@ class Monitor:
             changes=changes,
             scale=sums,
             void=state.void | ~stays_finite,
+            entered=entered[:, -1],
         )
         deviation = np.sqrt(np.diagonal(covariances[0], axis1=2, axis2=3))
         flags = alarm, ended, changed, counted, outside
@@ -367,6 +370,31 @@ class Monitor:
         low, high = np.minimum(low, least - margin), np.maximum(high, largest + margin)
         return np.asarray(((commands < low) | (commands > high)).any(axis=2))
 
+    @property
+    def _output_range(self) -> tuple[NDArray, NDArray]:
+        """The range (d_y,) of the outputs in both calibrations."""
+        count = len(self.twin.outputs)
+        low, high = self.noise.low[-count:], self.noise.high[-count:]
+        if self.twin.forecast is not None:
+            low = np.minimum(low, self.twin.forecast.low[-count:])
+            high = np.maximum(high, self.twin.forecast.high[-count:])
+        return low, high
+
+    def _entered(self, before: NDArray, measured: NDArray) -> NDArray:
+        """Whether outputs have been in their range up to each sample; see `MonitorState`."""
+        far = channel_excess(measured, *self._output_range) > FAR
+        now = np.where(np.isnan(measured), 0, np.where(far, 1, 2))
+        return np.maximum.accumulate(np.maximum(now, before[:, None]), axis=1)
+
+    def find_begin(self, record: Trajectories) -> float:
+        """Time in s before which an output has only been outside of its range in calibration.
+
+        A machine that begins so, such as a cold one, is in states of which nothing is promised.
+        """
+        nothing = np.zeros((len(record), len(self.twin.outputs)), dtype=np.int64)
+        outside = (self._entered(nothing, record.measured) == 1).any(axis=(0, 2))
+        return float(outside.sum()) / record.rate
+
     def find_excursions(self, record: Trajectories) -> dict[str, tuple[float, float, float, float]]:
         """Outputs that leave their range in both calibrations by a quarter of its width.
 
@@ -378,11 +406,7 @@ class Monitor:
             By output, the time in s at which one does first, the furthest value, and the range.
 
         """
-        count = len(self.twin.outputs)
-        low, high = self.noise.low[-count:], self.noise.high[-count:]
-        if self.twin.forecast is not None:
-            low = np.minimum(low, self.twin.forecast.low[-count:])
-            high = np.maximum(high, self.twin.forecast.high[-count:])
+        low, high = self._output_range
         found = {}
         for i, name in enumerate(self.twin.outputs.names):
             own = record.measured[..., i]

@@ -20,6 +20,8 @@ from retwin.update.dynamics.filter.online import FilterState
 Kind = TypeVar("Kind")
 PARTS = {"disturbance": DisturbanceState, "detector": DetectorState, "validity": ValidityState}
 """What the state of a monitor has of each stream."""
+OWN = ("changes", "scale", "void", "entered")
+"""Its other arrays."""
 SHARE = 0.9
 """Share of onsets after which a fault must have raised an alarm."""
 
@@ -43,6 +45,9 @@ class MonitorState:
         (n * M * d_y, 2), of the noise of each stream; see `own_scale`.
     void : NDArray
         (n,) bool, whether the promise does not apply to the machine.
+    entered : NDArray
+        (n, d_y), of each output 0 before it is measured, 1 while it has only been outside of the
+        range of the calibration, and 2 from then on.
 
     """
 
@@ -54,6 +59,7 @@ class MonitorState:
     changes: NDArray
     scale: NDArray
     void: NDArray
+    entered: NDArray
 
     def arrays(self) -> dict[str, NDArray]:
         """All arrays by name, whose first axis is that of machines."""
@@ -65,7 +71,8 @@ class MonitorState:
             found |= {key: each.reshape(count, -1, *each.shape[1:]) for key, each in own.items()}
         scale = self.scale.reshape(count, -1, 2)
         found |= arrays_of("course", self.course)
-        return found | {"changes": self.changes, "scale": scale, "void": self.void}
+        own = {"changes": self.changes, "void": self.void, "entered": self.entered}
+        return found | own | {"scale": scale}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, NDArray]) -> MonitorState:
@@ -76,7 +83,7 @@ class MonitorState:
                 rows[key] = each.reshape(-1, *each.shape[2:])
         filters = takewhile(lambda name: f"{name}.states" in rows, map(_filter, count()))
         every = tuple(part_of(FilterState, name, rows) for name in filters)
-        parts: dict[str, Any] = {name: rows[name] for name in ("changes", "scale", "void")}
+        parts: dict[str, Any] = {name: rows[name] for name in OWN}
         for name, kind in {**PARTS, "course": Course}.items():
             parts[name] = part_of(kind, name, rows)
         return cls(every, **parts)
