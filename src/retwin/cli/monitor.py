@@ -583,8 +583,8 @@ def _describe_free(monitor: Monitor, record: Trajectories) -> str:
     if not found:
         return ""
     return (
-        f" In free simulation {'; '.join(found)}: something has changed slowly, or the twin does "
-        "not hold here. The filter follows that, so it is no alarm and has no promise."
+        f" In free simulation {'; '.join(found)}: a change, which the filter may follow without an "
+        "alarm, or a twin that does not hold here. Nothing is promised of it."
     )
 
 
