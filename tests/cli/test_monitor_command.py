@@ -214,7 +214,7 @@ def test_a_monitor_that_sees_sensors_at_most_says_so(
         monkeypatch.setattr(monitor, "visible_sizes", lambda *_, **__: [leak, sensor])  # noqa: B023
         code, _, err = call(*given, "--false-alarms", "1 per day", "--out", tmp_path / f"{said}")
         assert code == 0, err
-        assert ("filter follows them as disturbances" in err) is said
+        assert ("filter follows it as a disturbance" in err) is said
 
 
 def test_what_cannot_calibrate_leaves_nothing(watched: Path, call, tmp_path) -> None:

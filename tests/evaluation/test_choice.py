@@ -446,7 +446,8 @@ def test_a_correction_that_is_better_by_chance_is_said_to_be_so() -> None:
     data = records(*range(4), slope=right)
     noise = rng.normal(size=data.observed.shape)
     (said,) = remarks_with(data, none=noise, dynamics=1.1 * noise)
-    assert said.startswith("Nothing to correct")
+    assert said.startswith("Nothing to correct: corrected state equations did not predict")
+    assert "Corrections of outputs were not tried; without --dynamics" in said
     other = 0.98 * rng.normal(size=noise.shape)
     (said,) = remarks_with(data, none=noise, dynamics=other)
     assert "No correction is clearly better than the twin" in said
@@ -554,7 +555,9 @@ def test_a_sample_that_predicts_better_is_named_as_what_it_is(
         ModelScore(who, "y", horizon, rmse, rmse, float("nan"), float("nan"))
         for who, rmse in (("model", 2.0), ("hold", 1.0))
     ]
-    assert _verdict(scores) == [f"y: the {sample} sample is a better prediction, by RMSE."]
+    assert _verdict(scores) == [
+        f"y: the {sample} sample is a better prediction, by RMSE: 1 in place of 2."
+    ]
 
 
 @pytest.mark.parametrize(
@@ -570,10 +573,13 @@ def test_a_sample_that_predicts_better_is_named_as_what_it_is(
 def test_a_band_that_holds_too_little_is_said_with_how_sure_that_is(
     coverage: float, interval: tuple[float, float] | None, text: str
 ) -> None:
-    model = ModelScore("model", "y", None, 1.0, 1.0, coverage, 1.0, interval)
+    model = ModelScore("model", "y", None, 0.4, 0.3, coverage, 1.0, interval)
     found = _verdict([model, ModelScore("mean", "y", None, 2.0, 2.0, *2 * [float("nan")])])
     assert len(found) == bool(text)
     assert text in " ".join(found)
+    (other,) = _verdict([replace(model, rmse=4.0, coverage=0.4)], started=True)
+    assert "holds 40% of these samples, and the RMSE is 13 times" in other
+    assert "--warm-up" not in other
 
 
 def test_an_output_that_has_nothing_in_common_with_the_model_is_named_as_such_alone() -> None:

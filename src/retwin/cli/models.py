@@ -269,6 +269,10 @@ HARDLY = 0.02
 FOREIGN, NOTHING = 2.0, 0.05
 """Ratio of the error to the spread of a record from which, and share inside the band below which, a
 record may be of another channel or machine."""
+NO_CHANCE = 3.0
+"""Ratio of the error to that of the band from which on a machine differs from the calibration."""
+START = ", or begin in other states, which --warm-up infers"
+"""What else may be the reason where starts are not inferred."""
 CLEAR = 0.01
 """Part of an error by which another predictor must be better to be mentioned."""
 
@@ -288,7 +292,7 @@ def _foreign(scores: list[ModelScore]) -> list[str]:
 def _verdict(scores: list[ModelScore], *, started: bool = False) -> list[str]:
     """What is better than the model, and whether its bands hold, in sentences."""
     from retwin.scores.uses import COVERAGE
-    from retwin.update.forecast_errors import LEVEL
+    from retwin.update.forecast_errors import LEVEL, USUAL
 
     own, foreign = {each.output: each for each in scores if each.who == "model"}, _foreign(scores)
     made = [
@@ -304,7 +308,10 @@ def _verdict(scores: list[ModelScore], *, started: bool = False) -> list[str]:
         if each.who != "model":
             model = own[each.output]
             if each.rmse < (1 - CLEAR) * model.rmse:
-                made.append(f"{each.output}: {words[each.who]} is a better prediction, by RMSE.")
+                made.append(
+                    f"{each.output}: {words[each.who]} is a better prediction, by RMSE: "
+                    f"{each.rmse:.3g} in place of {model.rmse:.3g}."
+                )
             elif each.who == "twin" and model.rmse > (1 - HARDLY) * each.rmse and not each.horizon:
                 made.append(
                     f"{each.output}: the RMSE is that of {words['twin']} within {HARDLY:.0%}: the "
@@ -312,6 +319,14 @@ def _verdict(scores: list[ModelScore], *, started: bool = False) -> list[str]:
                 )
         elif each.coverage < COVERAGE[0]:
             text = f"{each.output}: the 90 % band holds {each.coverage:.0%} of these samples"
+            ratio = each.rmse / max(each.width / 2 / USUAL, 1e-300)
+            if ratio > NO_CHANCE:
+                made.append(
+                    f"{text}, and the RMSE is {ratio:.2g} times what it allows for: this is no "
+                    "chance. The machine has changed, as by a fault, or works where the model "
+                    f"does not hold{START * (not started)}."
+                )
+                continue
             if each.interval is None or each.interval[1] >= LEVEL:
                 known = "fewer than five" if each.interval is None else "these"
                 made.append(
@@ -319,7 +334,7 @@ def _verdict(scores: list[ModelScore], *, started: bool = False) -> list[str]:
                     "chance: score more of other days before you rely on it."
                 )
                 continue
-            other = "" if started else ", or begin in other states, which --warm-up infers"
+            other = START * (not started)
             made.append(
                 f"{text}: do not rely on it here. These records may be of another day{other}."
             )

@@ -9,7 +9,7 @@ import tempfile
 import threading
 import warnings
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
@@ -170,9 +170,9 @@ def fit(
 
 
 BLIND = (
-    "this monitor sees no change of a parameter, or of the effect of a command, by less than all "
-    "of it: its filter follows them as disturbances. What replay says of free simulation may show "
-    "them"
+    "this monitor sees a change of a parameter, or of the effect of a command, only where it is "
+    "larger than that itself, if at all: its filter follows it as a disturbance. What replay says "
+    "of free simulation may show it"
 )
 """What is said of a monitor that detects faults of sensors at most."""
 
@@ -212,6 +212,7 @@ def replay(
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
         found.append((file, record, watched, causes))
+        rows += _describe_free(made, file.name, record)
         for trajectory, begin, end, what, lines in _event_rows(watched, causes, record.rate):
             own = f"{file.name}, {trajectory}" if len(record) > 1 else file.name
             rows.append(_describe_event(own, begin, end, what, lines))
@@ -553,9 +554,11 @@ def _summary(monitor: Monitor, file: Path, record: Trajectories, watched: Watche
             )
         )
     if watched.outside.any():
+        which = _ranges(monitor.find_commands_outside(record))
         text += (
             f"; in {int(watched.outside.sum())} of {len(record)} records commands leave the range "
-            "of the calibration, where the twin extrapolates and nothing is promised"
+            f"of the calibration{which and f' ({which})'}, where the twin extrapolates and nothing "
+            "is promised"
         )
     begin = monitor.find_begin(record)
     if begin:
@@ -563,29 +566,34 @@ def _summary(monitor: Monitor, file: Path, record: Trajectories, watched: Watche
             f"; until {begin:.6g} s outputs are outside of the range of the calibration, in states "
             "of which nothing is promised"
         )
-    outputs = [
-        f"{name}, {low:.4g} to {high:.4g} there, reaches {value:.4g} (outside from {first:.6g} s)"
-        for name, (first, value, low, high) in monitor.find_excursions(record).items()
-    ]
-    if outputs:
-        text += f". Outputs leave the range of the calibration: {'; '.join(outputs)}"
-    return f"{text}.{_describe_free(monitor, record)}"
+    outputs = _ranges(monitor.find_excursions(record))
+    return text + (f". Outputs leave the range of the calibration: {outputs}." if outputs else ".")
 
 
-def _describe_free(monitor: Monitor, record: Trajectories) -> str:
-    """What free simulation shows of changes that the filter follows; empty for nothing."""
+def _ranges(found: Mapping[str, tuple[float, float, float, float]]) -> str:
+    """Channels that leave their range: how far, and from when on."""
+    return "; ".join(
+        f"{name} reaches {value:.4g}, {low:.4g} to {high:.4g} there, outside from {first:.6g} s"
+        for name, (first, value, low, high) in found.items()
+    )
+
+
+def _describe_free(monitor: Monitor, file: str, record: Trajectories) -> list[str]:
+    """A line on what free simulation shows of changes that the filter follows, if anything."""
     units = dict(zip(record.outputs.names, record.outputs.units, strict=True))
+    off = monitor.find_free_errors(record)
     found = [
-        f"{name} is off by {largest:.3g} {units[name]}, at most {usual:.3g} in calibration (from "
-        f"{first:.6g} s)"
-        for name, (first, largest, usual) in monitor.find_free_errors(record).items()
+        f"{name} is off by up to {largest:.3g} {units[name]}, at most {usual:.3g} in calibration"
+        for name, (_, largest, usual) in off.items()
     ]
     if not found:
-        return ""
-    return (
-        f" In free simulation {'; '.join(found)}: a change, which the filter may follow without an "
-        "alarm, or a twin that does not hold here. Nothing is promised of it."
-    )
+        return []
+    since = min(first for first, _, _ in off.values())
+    return [
+        f"{file}, from {since:.6g} s: in free simulation {'; '.join(found)}: a fault, which the "
+        "filter may follow without an alarm, or a state in which the twin does not hold. Nothing "
+        "is promised of this."
+    ]
 
 
 def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> str:

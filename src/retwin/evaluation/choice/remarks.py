@@ -21,6 +21,8 @@ LONGEST = 0.1
 STARTED, HARDLY = 0.8, 0.98
 """Ratios of errors from which starts of records are named, and a correction is said to be one of
 bands alone."""
+UNCORRECTED = ("none", "parameters")
+"""The candidates that correct nothing."""
 AHEAD = 20
 """Samples ahead that are proposed where free simulation is worse than the mean."""
 WHITE, COLOURED = 0.01, 0.5
@@ -51,7 +53,7 @@ def remarks_of(
             "bands hold for further parts of the same. How much another day differs cannot be seen "
             f"from fewer than {RECORDS} records, of which whole ones are left out."
         )
-    if preferred in ("none", "parameters"):
+    if preferred in UNCORRECTED:
         made += _describe_uncorrected(comparison, by_name, preferred, free=horizon is None)
     baseline = "parameters" if "parameters" in comparison.predicted else "none"
     if baseline in comparison.predicted and horizon is None:
@@ -67,8 +69,13 @@ def _describe_uncorrected(
     Errors of free simulation are tested (`free`): others are correlated up to the time ahead.
     """
     who = "the twin with its identified parameters" if name == "parameters" else "the twin"
-    made = "Nothing to correct: no correction predicts parts of the records that were left out "
-    made += f"better than {who}."
+    tried = [scores[each].title for each in comparison.predicted if each not in UNCORRECTED]
+    made = f"Nothing to correct: {' and '.join(tried)} did not predict parts of the records that "
+    made += f"were left out better than {who}."
+    if [*comparison.predicted][-1] == "dynamics":
+        made += " Corrections of outputs were not tried; without --dynamics, fit tries them too."
+    if not tried:
+        made = "No correction was tried."
     if scores[name].difference > 0:
         best = min((scores[each] for each in comparison.predicted), key=lambda each: each.crps)
         made = f"No correction is clearly better than {who}: on parts of the records that were "
@@ -117,7 +124,7 @@ def correction_remarks(scores: Sequence[CandidateScore], chosen: str) -> list[st
     """That a correction changes the distribution of errors, and hardly their size."""
     rmse = {each.name: each.rmse for each in scores if each.rmse}
     before = rmse.get("parameters", rmse.get("none"))
-    if before is None or chosen not in rmse or chosen in ("none", "parameters"):
+    if before is None or chosen not in rmse or chosen in UNCORRECTED:
         return []
     if any(rmse[chosen][name] < HARDLY * error for name, error in before.items()):
         return []

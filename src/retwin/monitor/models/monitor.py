@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -34,7 +35,7 @@ from retwin.monitor.models.state import Alarm, Ending, MonitorState, Part, Visib
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.filter.online import OnlineFilter
 from retwin.update.dynamics.twin import BEYOND, DynamicsTwin
-from retwin.update.forecast_errors import channel_excess, range_excess
+from retwin.update.forecast_errors import channel_excess
 
 FAR = 0.25
 """Share of the width of its range by which an output that leaves it is named."""
@@ -362,12 +363,17 @@ class Monitor:
         )
         return known
 
-    def _outside(self, commands: NDArray) -> NDArray:
-        """Whether commands (n, T, d_u) leave their range in both calibrations, (n, T)."""
+    @property
+    def _command_range(self) -> tuple[NDArray, NDArray]:
+        """The range (d_u,) of the commands in both calibrations, and a little beyond."""
         low, high = (each[len(self.twin.process) :] for each in self.twin.bounds)
         least, largest = (each[: len(low)] for each in (self.noise.low, self.noise.high))
         margin = BEYOND * (largest - least)
-        low, high = np.minimum(low, least - margin), np.maximum(high, largest + margin)
+        return np.minimum(low, least - margin), np.maximum(high, largest + margin)
+
+    def _outside(self, commands: NDArray) -> NDArray:
+        """Whether commands (n, T, d_u) leave their range in both calibrations, (n, T)."""
+        low, high = self._command_range
         return np.asarray(((commands < low) | (commands > high)).any(axis=2))
 
     @property
@@ -406,17 +412,13 @@ class Monitor:
             By output, the time in s at which one does first, the furthest value, and the range.
 
         """
-        low, high = self._output_range
-        found = {}
-        for i, name in enumerate(self.twin.outputs.names):
-            own = record.measured[..., i]
-            excess = range_excess(own[..., None], low[[i]], high[[i]])
-            row, furthest = np.unravel_index(np.argmax(excess), excess.shape)
-            if excess[row, furthest] > FAR:
-                first = float(np.argmax(excess[row] > FAR)) / record.rate
-                ends = float(low[i]), float(high[i])
-                found[name] = (first, float(own[row, furthest]), *ends)
-        return found
+        return _excursions(record.outputs.names, record.measured, self._output_range, FAR, record)
+
+    def find_commands_outside(
+        self, record: Trajectories
+    ) -> dict[str, tuple[float, float, float, float]]:
+        """Commands that leave their range in both calibrations, as in `find_excursions`."""
+        return _excursions(record.inputs.names, record.commands, self._command_range, 0.0, record)
 
     def find_free_errors(self, record: Trajectories) -> dict[str, tuple[float, float, float]]:
         """Outputs that free simulation predicts much worse than in the calibration.
@@ -469,3 +471,21 @@ class Monitor:
     def load(cls, folder: str | Path) -> Monitor:
         """Read what `save` wrote. Raises InputError if it is no monitor or is damaged."""
         return cls(**read_fields(folder))
+
+
+def _excursions(
+    names: Sequence[str],
+    values: NDArray,
+    ends: tuple[NDArray, NDArray],
+    far: float,
+    record: Trajectories,
+) -> dict[str, tuple[float, float, float, float]]:
+    """Channels of values (n, T, d) that leave a range by more than a share of its width."""
+    low, high = ends
+    excess, found = channel_excess(values, low, high), {}
+    for i, name in enumerate(names):
+        row, furthest = np.unravel_index(np.argmax(excess[..., i]), excess.shape[:2])
+        if excess[row, furthest, i] > far:
+            first = float(np.argmax(excess[row, :, i] > far)) / record.rate
+            found[name] = (first, float(values[row, furthest, i]), float(low[i]), float(high[i]))
+    return found

@@ -62,7 +62,9 @@ def _coverage(shares: Mapping[str, float]) -> Cell:
     """The mean share in the bands of the outputs, and that of each where there are several."""
     known = {name: share for name, share in shares.items() if isfinite(share)}
     own = ", ".join(f"{name} {share:.0%}" for name, share in known.items())
-    return Cell(f"{mean(known.values()):.0%}" if known else "–", own if len(known) > 1 else "")
+    return Cell(
+        f"{mean(known.values()):.0%}" if known else "–", f"({own})" if len(known) > 1 else ""
+    )
 
 
 def parameter_table(found: Fitted) -> Table:
