@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 ModelFolder = Annotated[Path, option("FOLDER", "Where to save the updated twin.")]
 RealSet = Annotated[list[Path], option("FILE", "Real records; may be repeated.")]
 StateEquations = Annotated[
-    bool, option("", "Correct the state equations, unless that is clearly worse.", "--dynamics")
+    bool, option("", "Correct the state equations, if no worse.", "--dynamics")
 ]
 Correction = Annotated[
     str | None,
@@ -85,8 +85,7 @@ def fit(
     """Update a twin by real records; save the updated twin.
 
     The simplest candidate is taken that predicts left-out parts of the records
-    best; or that of --correction, or of a case with classes. --dynamics is taken
-    unless simpler candidates are clearly better.
+    best; or that of --dynamics, of --correction, or of a case with classes.
     """
     import retwin as rt
     from retwin.deploy.identified import identified_by
