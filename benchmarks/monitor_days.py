@@ -100,6 +100,7 @@ def watched(monitor: Monitor, day: rt.Trajectories, opened: NDArray, closed: NDA
         "named": float(named) if delays else np.nan,
         "largest delay in s": float(max(delays)) if delays else np.nan,
         "void hours": float((found.void[0] & healthy).sum() / day.rate / 3600),
+        "off in free simulation": float(len(monitor.find_free_errors(day))),
         "tried events": float(sum(monitor.tried.events.values())),
         "tried hours": sum(monitor.tried.samples.values()) / day.rate / 3600,
     }
@@ -184,6 +185,7 @@ def counted(monitor: Monitor, healthy: rt.Trajectories, offset: float) -> Row:
     """False events, and offsets in the second half of the records that are found after them."""
     found = monitor.watch(healthy)
     events, void = sum(each.promised for each in found.events), int(found.void[:, -1].sum())
+    free = [monitor.find_free_errors(healthy[[i]]) for i in range(len(healthy))]
     onset = healthy.steps // 2
     late = (np.arange(healthy.steps) >= onset)[None, :, None]
     offset = monitor.watch(healthy.replace(observed=healthy.observed + offset * late))
@@ -199,6 +201,7 @@ def counted(monitor: Monitor, healthy: rt.Trajectories, offset: float) -> Row:
         "upper bound": float(chi2.ppf(0.975, 2 * (events + 1)) / 2),
         "lower bound": float(chi2.ppf(0.025, 2 * events) / 2) if events else 0.0,
         "void": float(void),
+        "off in free simulation": float(sum(map(bool, free))),
         "offsets found": float(len(first)),
         "median delay": float(np.median([*first.values()])) if first else np.nan,
     }
