@@ -211,8 +211,9 @@ def replay(
         warn_unlike(made.twin, record)
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
-        found.append((file, record, watched, causes))
-        rows += _describe_free(made, file.name, record)
+        free = made.find_free_errors(record)
+        found.append((file, record, watched, causes, free))
+        rows += _describe_free(file.name, record, free)
         for trajectory, begin, end, what, lines in _event_rows(watched, causes, record.rate):
             own = f"{file.name}, {trajectory}" if len(record) > 1 else file.name
             rows.append(_describe_event(own, begin, end, what, lines))
@@ -220,7 +221,7 @@ def replay(
         {
             "arl": made.arl,
             "promises": {name: str(each) for name, each in made.promises.items()},
-            "records": [_json(made, *each) for each in found],
+            "records": [_json(*each) for each in found],
         },
         *rows,
         *(_summary(made, *each[:3]) for each in found),
@@ -578,10 +579,11 @@ def _ranges(found: Mapping[str, tuple[float, float, float, float]]) -> str:
     )
 
 
-def _describe_free(monitor: Monitor, file: str, record: Trajectories) -> list[str]:
+def _describe_free(
+    file: str, record: Trajectories, off: Mapping[str, tuple[float, float, float]]
+) -> list[str]:
     """A line on what free simulation shows of changes that the filter follows, if anything."""
     units = dict(zip(record.outputs.names, record.outputs.units, strict=True))
-    off = monitor.find_free_errors(record)
     found = [
         f"{name} is off by up to {largest:.3g} {units[name]}, at most {usual:.3g} in calibration"
         for name, (_, largest, usual) in off.items()
@@ -643,7 +645,11 @@ def _describe_promise(monitor: Monitor) -> str:
 
 
 def _json(
-    monitor: Monitor, file: Path, record: Trajectories, watched: Watched, causes: list[Cause]
+    file: Path,
+    record: Trajectories,
+    watched: Watched,
+    causes: list[Cause],
+    free: Mapping[str, tuple[float, float, float]],
 ) -> dict:
     alarms = [vars(each) | {} for each in watched.alarms]
     for alarm, cause in zip(alarms, causes, strict=False):
@@ -655,6 +661,6 @@ def _json(
         "endings": [vars(each) for each in watched.endings],
         "void": [record.ids[i] for i, each in enumerate(watched.void) if each[-1]],
         "outside": [record.ids[i] for i, each in enumerate(watched.outside) if each],
-        "free_simulation": monitor.find_free_errors(record),
+        "free_simulation": free,
         "measured_samples": int(record.mask.any(axis=2).sum()),
     }

@@ -41,6 +41,8 @@ FAR = 0.25
 """Share of the width of its range by which an output that leaves it is named."""
 FREE = 2.0
 """Times the largest error of free simulation in calibration from which on a larger one is named."""
+SMALL = 1e-3
+"""Share of the values of an output up to which its errors are none: of twins that are exact."""
 SIZE = 256
 """Samples that are predicted at once: those after an alarm are predicted again. While an event
 lasts, where alarms are frequent, an eighth of them."""
@@ -437,9 +439,12 @@ class Monitor:
         if found is None:
             return {}
         size, length = found[0].max(axis=0), found[1]
+        low, high = self._output_range
+        hardly = SMALL * np.maximum(high - low, np.maximum(np.abs(low), np.abs(high)))
         made = {}
-        for own, usual, name in zip(size.T, self.free, self.twin.outputs.names, strict=True):
-            beyond = own > FREE * usual
+        names = self.twin.outputs.names
+        for own, usual, least, name in zip(size.T, self.free, hardly, names, strict=True):
+            beyond = own > FREE * max(usual, least)
             if beyond.any():
                 first = float(beyond.argmax()) * length / record.rate
                 made[name] = (first, float(own.max()), usual)
