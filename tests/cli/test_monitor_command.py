@@ -253,7 +253,7 @@ def test_equations_that_are_not_corrected_are_watched_and_else_a_black_box(
     code, printed, err = call("monitor", "replay", out, watched / "leak.npz")
     assert code == 0, err
     assert "1 event" in printed
-    assert "In free simulation level is off by" in printed
+    assert "in free simulation level is off by" in printed
 
 
 @pytest.mark.slow
