@@ -78,6 +78,8 @@ def test_an_event_has_the_newest_size_of_the_cause_that_opened_it() -> None:
     (row,) = _event_rows(remark, [found], 1.0)  # type: ignore[arg-type]
     assert row[-2].startswith("remark: ")
     assert row[-1][0].startswith("if it is a fault, and the twin holds there: leaking from 2.0 s")
+    (row,) = _event_rows(watched, [found], 1.0, left=3.0)  # type: ignore[arg-type]
+    assert row[-1][0].startswith("if the twin holds there: leaking from 2.0 s")
     second = replace(within, name="weak pump", size=(-0.5, -0.6, -0.4), unit="", same=False)
     (row,) = _event_rows(watched, [found, second], 1.0)  # type: ignore[arg-type]
     newest = "weak pump from 3.1 s; size -0.5 (-0.6 to -0.4), probability 0.80"

@@ -446,8 +446,8 @@ def test_a_correction_that_is_better_by_chance_is_said_to_be_so() -> None:
     data = records(*range(4), slope=right)
     noise = rng.normal(size=data.observed.shape)
     (said,) = remarks_with(data, none=noise, dynamics=1.1 * noise)
-    assert said.startswith("Nothing to correct: corrected state equations did not predict")
-    assert "Corrections of outputs were not tried; without --dynamics" in said
+    assert said.startswith("No correction helps: corrected state equations did not predict")
+    assert "Corrections of outputs were not tried: without --dynamics" in said
     other = 0.98 * rng.normal(size=noise.shape)
     (said,) = remarks_with(data, none=noise, dynamics=other)
     assert "No correction is clearly better than the twin" in said

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
-from math import isnan
+from math import inf, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -182,7 +182,8 @@ def _describe_visible(visible: Sequence[Visible]) -> list[str]:
     from retwin.monitor.models.state import SHARE
 
     hidden = [each.fault for each in visible if each.share < SHARE]
-    rest = f"Not seen at any size that was tried: {'; '.join(hidden)}"
+    rest = "Not seen at any size in the ranges of parameters, commands and outputs: "
+    rest += "; ".join(hidden)
     return [*(str(each) for each in visible if each.share >= SHARE), *([rest] if hidden else [])]
 
 
@@ -214,7 +215,9 @@ def replay(
         free = made.find_free_errors(record)
         found.append((file, record, watched, causes, free))
         rows += _describe_free(file.name, record, free)
-        for trajectory, begin, end, what, lines in _event_rows(watched, causes, record.rate):
+        outputs = made.find_excursions(record).values()
+        left = min((first for first, *_ in outputs), default=inf)
+        for trajectory, begin, end, what, lines in _event_rows(watched, causes, record.rate, left):
             own = f"{file.name}, {trajectory}" if len(record) > 1 else file.name
             rows.append(_describe_event(own, begin, end, what, lines))
     answer(
@@ -224,7 +227,7 @@ def replay(
             "records": [_json(*each) for each in found],
         },
         *rows,
-        *(_summary(made, *each[:3]) for each in found),
+        *(_summary(made, *each[:3], changed=bool(each[4])) for each in found),
         _rates(made, [(each[1], each[2]) for each in found]),
         as_json=as_json,
     )
@@ -474,9 +477,11 @@ def _causes(
 
 
 def _event_rows(
-    watched: Watched, causes: Sequence[Cause], rate: float
+    watched: Watched, causes: Sequence[Cause], rate: float, left: float = inf
 ) -> list[tuple[str, str, str, str, list[str]]]:
     """Record, begin, end and change of each event, and lines with its causes, the newest first.
+
+    From `left` s on outputs are outside of the range of the calibration.
 
     Events of a record that follow one with the same cause are in the row of that: a fault that
     lasts may not show for a while.
@@ -518,7 +523,8 @@ def _event_rows(
             again = f"again, or still, {times} until {begin} s, then {texts[0]}"
             rows[-1] = (*rows[-1][:2], until, rows[-1][3], [*shown, again])
         else:
-            further, prefix = 0, "" if first.promised else EXTRAPOLATED
+            holds = "if the twin holds there: " if first.time >= left else ""
+            further, prefix = 0, holds if first.promised else EXTRAPOLATED
             shown = [(EARLIER if i else prefix) + each for i, each in enumerate(texts)]
             rows.append((first.trajectory, begin, until, what, shown))
         before = (first.trajectory, named[-1].name) if named else ("", "")
@@ -531,14 +537,17 @@ def _describe_event(record: str, begin: str, end: str, what: str, causes: Sequen
     return "\n    ".join([f"{record}, from {begin} s{until}: {what}", *causes])
 
 
-def _summary(monitor: Monitor, file: Path, record: Trajectories, watched: Watched) -> str:
-    """What was watched, and whether the promise applied."""
+def _summary(
+    monitor: Monitor, file: Path, record: Trajectories, watched: Watched, *, changed: bool
+) -> str:
+    """What was watched, and whether the promise applied; `changed` in free simulation."""
     from retwin.report.labels import counted
 
     seconds = record.mask.any(axis=2).sum() / record.rate
     void = [float(each.argmax()) / record.rate for each in watched.void if each[-1]]
     events = sum(each.promised for each in watched.events)
     text = f"{file.name}: {counted(events, 'event')} in {seconds / 3600:.3g} measured hours"
+    text += ", but free simulation shows a change, see above" * (changed and not events)
     remarks = len(watched.events) - events
     if remarks:
         text += f", and {counted(remarks, 'remark')} where nothing is promised"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
@@ -25,6 +26,8 @@ CLEAR = 0.5
 """Ratio of residuals from which exchanged commands are named."""
 UNEXPLAINED = 0.1
 """Share of the variance that a twin leaves, below which commands are in their places."""
+DIVERGED = 1e100
+"""Size of outputs that no simulation has which does not diverge, and whose square is finite."""
 PAIRS = 15
 """Pairs of commands that are tried, at most."""
 
@@ -59,15 +62,16 @@ def simulated(twin: Twin, records: Trajectories) -> NDArray | None:
     Starts of states that the twin does not state are those that fit each record.
     """
     try:
-        if isinstance(twin, ParametricTwin):
-            made = simulated_outputs(twin, records, records.mask, seed=0, own=True)
-        elif isinstance(twin, DynamicsTwin):
-            made = started_moments(twin, records, records.steps / records.rate)[0]
-        else:
-            made = twin.simulate(records.commands, seed=0).observed
+        with np.errstate(all="ignore"):  # of a simulation that diverges nothing else is to be said
+            if isinstance(twin, ParametricTwin):
+                made = simulated_outputs(twin, records, records.mask, seed=0, own=True)
+            elif isinstance(twin, DynamicsTwin):
+                made = started_moments(twin, records, records.steps / records.rate)[0]
+            else:
+                made = twin.simulate(records.commands, seed=0).observed
     except (InputError, SimulationError):
         return None
-    return made if np.isfinite(made).all() else None
+    return made if np.all(np.abs(made) < DIVERGED) else None
 
 
 def _find_exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
@@ -80,7 +84,9 @@ def _find_exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
         order = np.arange(len(names))
         order[[a, b]] = order[[b, a]]
         other = healthy.replace(commands=healthy.commands[..., order])
-        ideal = simulated(twin, other)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of commands that the machine never had
+            ideal = simulated(twin, other)
         if ideal is None:
             continue
         there = _unexplained_share(other.replace(nominal=ideal))

@@ -70,10 +70,11 @@ def _describe_uncorrected(
     """
     who = "the twin with its identified parameters" if name == "parameters" else "the twin"
     tried = [scores[each].title for each in comparison.predicted if each not in UNCORRECTED]
-    made = f"Nothing to correct: {' and '.join(tried)} did not predict parts of the records that "
+    made = f"No correction helps: {' and '.join(tried)} did not predict parts of the records that "
     made += f"were left out better than {who}."
     if [*comparison.predicted][-1] == "dynamics":
-        made += " Corrections of outputs were not tried; without --dynamics, fit tries them too."
+        made += " Corrections of outputs were not tried: without --dynamics, fit tries them too, "
+        made += "and takes several times as long."
     if not tried:
         made = "No correction was tried."
     if scores[name].difference > 0:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
+from retwin.update.agreement import DIVERGED
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.forecasts import begin_of, started_moments
 
@@ -33,10 +34,11 @@ def free_errors(twin: DynamicsTwin, records: Trajectories) -> tuple[NDArray, int
     """
     begin = begin_of(records)
     try:
-        mean = started_moments(twin, records, begin)[0]
+        with np.errstate(all="ignore"):
+            mean = started_moments(twin, records, begin)[0]
     except InputError:
         return None
-    if not np.isfinite(mean).all():
+    if not np.all(np.abs(mean) < DIVERGED):
         return None
     error = np.where(records.mask, records.observed - mean, np.nan)
     error[:, : round(begin * records.rate)] = np.nan

@@ -40,7 +40,8 @@ def warn_of_coarse_steps(
     """
     error = np.sqrt(np.mean((outputs - finer) ** 2, axis=0))
     # An output that hardly varies is compared with its size, of which rounding is a fraction.
-    allowed = ACCURACY * np.maximum(finer.std(axis=0), 1e-6 * np.abs(finer).max(axis=0))
+    with np.errstate(over="ignore"):  # of outputs that grow beyond what can be squared
+        allowed = ACCURACY * np.maximum(finer.std(axis=0), 1e-6 * np.abs(finer).max(axis=0))
     worst = int(np.argmax(error - allowed))
     if error[worst] <= allowed[worst]:
         return
