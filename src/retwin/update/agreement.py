@@ -71,7 +71,7 @@ def simulated(twin: Twin, records: Trajectories) -> NDArray | None:
                 made = twin.simulate(records.commands, seed=0).observed
     except (InputError, SimulationError):
         return None
-    return made if np.all(np.abs(made) < DIVERGED) else None
+    return made if np.all(np.abs(made, dtype=float) < DIVERGED) else None
 
 
 def _find_exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:

@@ -38,7 +38,7 @@ def free_errors(twin: DynamicsTwin, records: Trajectories) -> tuple[NDArray, int
             mean = started_moments(twin, records, begin)[0]
     except InputError:
         return None
-    if not np.all(np.abs(mean) < DIVERGED):
+    if not np.all(np.abs(mean, dtype=float) < DIVERGED):
         return None
     error = np.where(records.mask, records.observed - mean, np.nan)
     error[:, : round(begin * records.rate)] = np.nan
