@@ -51,6 +51,7 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.twin_data import TwinData
     from retwin.monitor import Alarm, Cause, Monitor, Watched
     from retwin.monitor.models.state import Visible
+    from retwin.twins import ParametricTwin, StateTwin
     from retwin.update import CorrectedTwin, DynamicsTwin
 
 EQUATIONS = (
@@ -125,8 +126,9 @@ def fit(
     with bar("calibrate") as show:
         show("monitor", 0.0)
         given = Trajectories.concatenate(records)
-        corrected = equations is None or isinstance(equations, DynamicsTwin)
-        known = equations if corrected else estimate_noise(equations, given)
+        known = equations if isinstance(equations, DynamicsTwin) else None
+        if equations is not None and known is None:
+            known = estimate_noise(equations, given)
         checked = check_with_twin(known, given)
         more = {} if lasting is None else {"lasting": lasting}
         made = fit_monitor(known, given, false_alarms, **more)
@@ -143,7 +145,7 @@ def fit(
     box = f"No twin: a black box, calibrated on {hours:.3g} h of your data; causes are channels."
     if updated:
         box = f"{model} has no state equations, which alone are followed. {box} {EQUATIONS}"
-    if not corrected:
+    if known is not equations:
         box = (
             f"{model} corrects no state equations: those of the twin are followed as they are, "
             "with noise as in these records."
@@ -155,7 +157,7 @@ def fit(
         {"saved": str(out), **about, "promises": promises, "tried": vars(made.tried)}
         | {"records": checked.values, "visible": [vars(each) for each in made.visible]},
         *shown_records(checked),
-        *([] if known and corrected else [box]),
+        *([] if known and known is equations else [box]),
         *fitted_remarks(model if known else None, given, "the promise may not hold for new ones"),
         _describe_promise(made),
         f"Tried: {tried}",
@@ -431,7 +433,9 @@ def recalibrate(
     answer(vars(version), text, as_json=as_json)
 
 
-def _equations_of(model: CorrectedTwin | DynamicsTwin | None) -> Any:
+def _equations_of(
+    model: CorrectedTwin | DynamicsTwin | None,
+) -> DynamicsTwin | StateTwin | ParametricTwin | None:
     """What follows a machine sample by sample: corrected state equations, or those of the twin.
 
     A residual of outputs after them is no part of it. None where there are no state equations.

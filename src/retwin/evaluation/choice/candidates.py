@@ -123,7 +123,7 @@ class Candidates:
         """Corrected state equations."""
         return replace(self.learned.twin, case=self.case)
 
-    def uncorrected(self, name: str) -> DynamicsTwin:
+    def keep_equations(self, name: str) -> DynamicsTwin:
         """The state equations of "none" or "parameters", with noise of states and outputs."""
         own = self.twin if name == "none" else self.identified
         return replace(estimate_noise(own, self.records), case=self.case)  # type: ignore[arg-type]

@@ -156,7 +156,7 @@ def fit(
     wanted = settings.method
     excess, error = differences.get(wanted, (np.inf, 0.0))
     chosen = wanted if wanted and (settings.forced or excess <= error) else preferred
-    model = _calibrate(_taken(whole, chosen, given), trials, chosen, free)
+    model = _calibrate(_fit_chosen(whole, chosen, given), trials, chosen, free)
     scores = tuple(
         _row(name, comparison, differences, trials.seconds[name], reasons.get(name, ""))
         for name in trials.names
@@ -196,13 +196,13 @@ def fit(
     return with_yardstick(found, seed=seed) if settings.yardstick else found
 
 
-def _taken(whole: Candidates, chosen: str, given: Model | None) -> Model:
+def _fit_chosen(whole: Candidates, chosen: str, given: Model | None) -> Model:
     """The chosen candidate, fitted to all records; `given` is that of `settings.method`."""
     wanted = whole.settings.method
     if given is not None and chosen == wanted:
         return given
     if wanted == "dynamics" and chosen in ("none", "parameters"):
-        return whole.uncorrected(chosen)  # what is done with state equations works with it too
+        return whole.keep_equations(chosen)  # what is done with state equations works with it too
     return whole.fits[chosen]()
 
 

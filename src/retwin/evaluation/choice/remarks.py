@@ -70,13 +70,13 @@ def _describe_uncorrected(
     """
     who = "the twin with its identified parameters" if name == "parameters" else "the twin"
     tried = [scores[each].title for each in comparison.predicted if each not in UNCORRECTED]
-    made = f"No correction helps: {' and '.join(tried)} did not predict parts of the records that "
-    made += f"were left out better than {who}."
-    if [*comparison.predicted][-1] == "dynamics":
+    made = "No correction was tried."
+    if tried:
+        made = f"No correction helps: {' and '.join(tried)} did not predict parts of the records "
+        made += f"that were left out better than {who}."
+    if "dynamics" in scores and "output" not in scores:
         made += " Corrections of outputs were not tried: without --dynamics, fit tries them too, "
         made += "and takes several times as long."
-    if not tried:
-        made = "No correction was tried."
     if scores[name].difference > 0:
         best = min((scores[each] for each in comparison.predicted), key=lambda each: each.crps)
         made = f"No correction is clearly better than {who}: on parts of the records that were "

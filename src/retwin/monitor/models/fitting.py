@@ -121,7 +121,8 @@ def fit_monitor(
     calibrated = partial(_calibrated, twin, healthy, measured, steps)
     first = given("healthy", calibrated(Predictor()), expected, got="others", remedy=remedy)
     found = [first, *_slower(twin, healthy.steps, calibrated)]
-    for note in _badly_followed(healthy, np.concatenate([each.error for each in found], axis=2)):
+    errors = np.concatenate([each.error for each in found], axis=2)
+    for note in _describe_larger_errors(healthy, errors):
         warnings.warn(f"healthy: {note}", stacklevel=2)
     error, width = (_joined([getattr(each, of) for each in found]) for of in ("error", "width"))
     names, folds = _folds(healthy, np.isfinite(error).all(axis=0))
@@ -202,7 +203,7 @@ def _calibrated(
     return _Calibrated(known, *errors, noted)
 
 
-def _badly_followed(healthy: Trajectories, error: NDArray) -> list[str]:
+def _describe_larger_errors(healthy: Trajectories, error: NDArray) -> list[str]:
     """What to say of records that the twin follows much worse than most of the others, for a time.
 
     Parameters

@@ -251,7 +251,7 @@ class Monitor:
                 learn[:, None], end_evidence, validity.detector.evidence_of_end(*given, low, high)
             )
         ended = rules.ends(state.course, total, end_evidence, counted) & ~alarm
-        entered = self._entered(state.entered, measured)
+        entered = self._find_entry(state.entered, measured)
         outside = self._outside(commands) | (entered == 1).any(axis=2)
         changed = rules.changes(state.course, samples) & ~ended
         stays_finite = np.all([np.isfinite(each).all(axis=(1, 2)) for each in means], axis=0)
@@ -388,8 +388,8 @@ class Monitor:
             high = np.maximum(high, self.twin.forecast.high[-count:])
         return low, high
 
-    def _entered(self, before: NDArray, measured: NDArray) -> NDArray:
-        """Whether outputs have been in their range up to each sample; see `MonitorState`."""
+    def _find_entry(self, before: NDArray, measured: NDArray) -> NDArray:
+        """Whether outputs (n, T, d_y) have been in their range; see `MonitorState.entered`."""
         far = channel_excess(measured, *self._output_range) > FAR
         now = np.where(np.isnan(measured), 0, np.where(far, 1, 2))
         return np.maximum.accumulate(np.maximum(now, before[:, None]), axis=1)
@@ -400,7 +400,7 @@ class Monitor:
         A machine that begins so, such as a cold one, is in states of which nothing is promised.
         """
         nothing = np.zeros((len(record), len(self.twin.outputs)), dtype=np.int64)
-        outside = (self._entered(nothing, record.measured) == 1).any(axis=(0, 2))
+        outside = (self._find_entry(nothing, record.measured) == 1).any(axis=(0, 2))
         return float(outside.sum()) / record.rate
 
     def find_excursions(self, record: Trajectories) -> dict[str, tuple[float, float, float, float]]:
