@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.special import gammaln, softmax
 from torch import Tensor
 
 from retwin.inference.hyperprior import Hyperprior, Variances
@@ -29,6 +30,9 @@ from retwin.inference.solver import Solution
 FREEDOM = 2.0
 """Degrees of freedom of the scaled inverse chi-squared hyperpriors: what a variance is expected to
 be counts as much as two observations."""
+TIED = FREEDOM * 2.0 ** np.arange(6)
+"""The same for variances of tied groups, which are as probable beforehand: how alike the groups
+are is learned."""
 TOLERANCE = 1e-3
 """Relative change of all variances below which they have converged."""
 MAX_STEPS = 200
@@ -195,7 +199,7 @@ class Hierarchy:
         """The hyperparameters to begin with: variances (G,), certain coefficients (F,)."""
         count = len(coefficients)
         common = variance * float((design.kind == CONDITION).any())
-        level = _level(design, variance)
+        level, _ = _level(design, variance)
         certain = variance.new_zeros(count, count)
         return cls(variance, common, design.share * level, coefficients, certain, expected)
 
@@ -385,7 +389,7 @@ class Hierarchy:
             found = _scaled(total + usual.count * usual.expected, count + usual.count, rng)
             return found.minimum((LARGEST * design.unit).square())
 
-        usual = self.expected.error or self._usual(design, self.variance, rng)
+        usual = self.expected.error or _usual(design, self.variance, rng)
         variance = update(sum_by_group(error * used), sum_by_group(used), usual)
         total, count = sum_by_group(effect * single), sum_by_group(single)
         shown = ((design.features * used[..., None]).abs().sum(dim=(0, 1)) > 0).to(beta)
@@ -394,7 +398,7 @@ class Hierarchy:
         count = count.index_add(0, design.owner, shown)
         common = self.common
         if (design.kind == CONDITION).any():
-            usual = self.expected.effect or self._usual(design, self.common, rng)
+            usual = self.expected.effect or _usual(design, self.common, rng)
             common = update(total, count, usual)
         some = design.kind != CONDITION
         kind, owner = design.kind[some], design.owner[some]
@@ -402,16 +406,9 @@ class Hierarchy:
         nothing = torch.zeros_like(self.relative)
         sums = nothing.index_add(0, kind, share)
         counts = nothing.index_add(0, kind, torch.ones_like(share))
-        expected = design.share * _level(design, variance + common)
+        expected = design.share * _level(design, variance + common)[0]
         relative = _scaled(sums + FREEDOM * expected, counts + FREEDOM, rng).clamp_max(LARGEST**2)
         return replace(self, variance=variance, common=common, relative=relative)
-
-    def _usual(self, design: Design, before: Tensor, rng: np.random.Generator | None) -> Variances:
-        """What variances (G,) are expected to be if nothing but their units is known."""
-        first, last = design.tied
-        expected = design.unit.square().clone()
-        expected[first:last] *= _level(design, before, rng)
-        return Variances(expected, torch.full_like(expected, FREEDOM))
 
 
 def normal(like: Tensor, rng: np.random.Generator) -> Tensor:
@@ -424,15 +421,36 @@ def _scaled(total: Tensor, count: Tensor, rng: np.random.Generator | None) -> Te
     return total / (count if rng is None else torch.from_numpy(rng.chisquare(count.numpy())))
 
 
-def _level(design: Design, variance: Tensor, rng: np.random.Generator | None = None) -> Tensor:
+def _usual(design: Design, before: Tensor, rng: np.random.Generator | None) -> Variances:
+    """What variances (G,) are expected to be if nothing but their units is known."""
+    first, last = design.tied
+    level, freedom = _level(design, before, rng)
+    expected, count = design.unit.square().clone(), torch.full_like(before, FREEDOM)
+    expected[first:last] *= level
+    count[first:last] = freedom
+    return Variances(expected, count)
+
+
+def _level(
+    design: Design, variance: Tensor, rng: np.random.Generator | None = None
+) -> tuple[float, float]:
     """What variances (G,) of tied groups are expected to be, in squares of their units.
 
-    It is the most probable value, or a draw. Beforehand its root, a standard deviation, is
-    half-normal with a scale of one unit: any smaller one is as probable.
+    It is the most probable value, or a draw, with the degrees of freedom. Beforehand its root, a
+    standard deviation, is half-normal with a scale of one unit: any smaller one is as probable.
     """
     first, last = design.tied
     if first == last:
-        return variance.new_ones(())
-    precision = FREEDOM * (design.unit.square() / variance)[first:last].sum() + 1
-    count = (last - first) * FREEDOM + 1
-    return (count if rng is None else float(rng.chisquare(count))) / precision
+        return 1.0, FREEDOM
+    relative = (variance / design.unit.square())[first:last].numpy()
+    # The density of the variances for every number of degrees of freedom, over all levels.
+    half, size = TIED / 2, last - first
+    count, precision = size * TIED + 1, TIED * (1 / relative).sum() + 1
+    density = size * (half * np.log(half) - gammaln(half)) - (half + 1) * np.log(relative).sum()
+    density += gammaln(count / 2) - count / 2 * np.log(precision / 2)
+    weight = softmax(density)
+    if rng is None:
+        freedom = float(np.exp(weight @ np.log(TIED)))
+        return (size * freedom + 1) / (freedom * (1 / relative).sum() + 1), freedom
+    drawn = rng.choice(len(TIED), p=weight)
+    return float(rng.chisquare(count[drawn]) / precision[drawn]), float(TIED[drawn])

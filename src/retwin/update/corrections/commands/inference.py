@@ -33,7 +33,7 @@ from retwin.update.corrections.commands.missed_segments import (
     fitted,
     searched,
 )
-from retwin.update.corrections.commands.offset_features import FIRST_OFFSET, OffsetFeatures
+from retwin.update.corrections.commands.offset_features import OffsetFeatures
 from retwin.update.corrections.commands.problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import at_bound, first_delays
@@ -103,7 +103,7 @@ def infer_commands(
     replicates = features.replicates(problem)
     uncertain = problem.counted_once(replicates)
     problem = uncertain.where_certain
-    missed = first_missed(problem, FIRST_OFFSET * features.spread, FIRST_ODDS)
+    missed = first_missed(problem, features.unit, FIRST_ODDS)
     problem = problem.with_missed(missed)
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
     others = context.others
@@ -246,11 +246,10 @@ class Hyperparameters:
         # The median of nothing is NaN.
         length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
         scale = length.clamp_min(FLOOR).expand(2, 1)
-        offset = FIRST_OFFSET * features.spread
         design = features.design(problem)
         coefficients = torch.zeros(len(design.owner), dtype=torch.float64)
         coefficients[0] = delay.median()
-        variance = torch.cat([jitter[None], offset, jitter[None]]).square()
+        variance = torch.cat([jitter[None], features.unit, jitter[None]]).square()
         one = torch.ones(2, dtype=torch.float64)
         # Within its range a common delay may be anything, as by a uniform distribution.
         limits = problem.delay_range
@@ -258,7 +257,7 @@ class Hyperparameters:
         if others is not None:
             expected = others.hyperprior(rate, replicated=len(features.replicated) > 0)
             missed = others.missed
-            coefficients[: len(offset) + 1] = torch.as_tensor(expected.flat[0])
+            coefficients[: len(features.unit) + 1] = torch.as_tensor(expected.flat[0])
         return cls(
             features,
             Hierarchy.of(design, variance, coefficients, expected),

@@ -14,6 +14,7 @@ from torch import Tensor
 from retwin.inference.hierarchy import CONDITION, FLAT, Design
 from retwin.update.corrections.commands.effective_commands import STILL
 from retwin.update.corrections.commands.problem import CommandProblem
+from retwin.update.corrections.correction import DifferentiableTwin
 
 OWN_FEATURES = 3
 """Features of an actuator's own motion: a constant, its direction, and its distance."""
@@ -25,8 +26,8 @@ MAX_EFFECTS = 1000
 EQUAL = 0.01
 """Distance, in the spread of the targets, below which commands are equal."""
 FIRST_OFFSET = 0.05
-"""Standard deviation of an offset at first, in that of the commands' targets, and the scale of its
-half-normal prior."""
+"""Standard deviation of an offset at first, in that of the targets of actuators of its kind, and
+the scale of its half-normal prior."""
 DELAY_VARIANCE = 1 / 12
 """Variance of the delays that the hyperprior expects, in samples squared: that of the time of an
 event within a sample."""
@@ -48,6 +49,9 @@ class OffsetFeatures:
         (d_u,), mean and standard deviation of the targets.
     travel : Tensor
         (d_u,), root mean square of the distance from target to target.
+    unit : Tensor
+        (d_u,), standard deviations of the offsets at first. They are alike for actuators whose
+        commands have the same unit: how far a program moves one says little of its errors.
     replicated : Tensor
         (C, 2 d_u), the conditions that are there more than once, see `conditions`.
     regression : bool
@@ -60,6 +64,7 @@ class OffsetFeatures:
     centre: Tensor
     spread: Tensor
     travel: Tensor
+    unit: Tensor
     replicated: Tensor
     regression: bool = False
     constants_expected: bool = False
@@ -75,9 +80,11 @@ class OffsetFeatures:
         apart = (last - centre, last - first)
         spread, travel = (each.square().mean(dim=0).sqrt() for each in apart)
         smallest = STILL * problem.reference.abs().amax(dim=(0, 1))
+        moved = (travel > smallest) | (spread > smallest)
         travel = torch.where(travel <= smallest, 1.0, travel)
         spread = torch.where(spread <= smallest, travel, spread)
-        found = cls(centre, spread, travel, centre.new_zeros(0, 2 * len(centre)))
+        unit = FIRST_OFFSET * _pool_alike(spread, moved, problem.surrogate)
+        found = cls(centre, spread, travel, unit, centre.new_zeros(0, 2 * len(centre)))
         every, counts = found.conditions(problem)[problem.valid].unique(dim=0, return_counts=True)
         return replace(found, replicated=every[counts > 1][: MAX_EFFECTS // problem.size])
 
@@ -140,7 +147,7 @@ class OffsetFeatures:
             kind=torch.cat([zero, kinds, torch.full((effects,), CONDITION)]),
             single=single[..., None].expand_as(wider).flatten(1),
             tied=(1, 1 + width),
-            unit=torch.cat([delay, FIRST_OFFSET * self.spread, delay]),
+            unit=torch.cat([delay, self.unit, delay]),
             share=share,
         )
 
@@ -170,3 +177,16 @@ class OffsetFeatures:
         # An actuator's own target first: coefficients of a kind share a variance.
         order = (torch.arange(width)[:, None] + torch.arange(width)) % width
         return torch.cat([own, every.gather(-1, order.expand_as(every))], dim=-1)
+
+
+def _pool_alike(spread: Tensor, moved: Tensor, surrogate: DifferentiableTwin) -> Tensor:
+    """Root mean square (d_u,) of the spreads of those that moved and have commands of one unit.
+
+    An actuator whose unit is not known is alone.
+    """
+    channels = getattr(surrogate, "inputs", None)
+    units = channels.units if channels else [""] * len(spread)
+    alike = torch.tensor([[a == b != "" for b in units] for a in units]) & moved
+    alone = ~alike.any(dim=1)
+    weight = alike.to(spread) + torch.diag(alone.to(spread))
+    return (weight @ spread.square() / weight.sum(dim=1)).sqrt()
