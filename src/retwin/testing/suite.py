@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -164,6 +164,11 @@ def _generators() -> dict[str, object]:
     if torch := sys.modules.get("torch"):
         states["torch"] = torch.get_rng_state().numpy().tobytes()
     return states
+
+
+def checks_in(module: Mapping[str, Any]) -> tuple[Callable[[Any], None], ...]:
+    """The contract that a module states, given its names: its functions `check_…`, in order."""
+    return tuple(each for name, each in module.items() if name.startswith("check_"))
 
 
 def run_checks(checks: Iterable[Callable[[Subject], None]], subject: Subject, title: str) -> None:
