@@ -27,6 +27,7 @@ from retwin.twins.faults.applied_faults import (
 )
 from retwin.twins.faults.system_faults import check_faults, measured_with
 from retwin.twins.limits import Limits
+from retwin.twins.workers import keep_workers
 from retwin.workers.threads import Turns, in_threads
 
 
@@ -275,6 +276,8 @@ class Chunk:
     turn : context manager
         A block that the simulations of all chunks enter in order, for what draws from a generator
         that they share, or changes other things in common.
+    report : callable
+        Takes the share of this chunk that is done, where a chunk takes long.
 
     """
 
@@ -289,6 +292,7 @@ class Chunk:
     failed: dict[int, str] = field(default_factory=dict)
     known: dict[int, int] = field(default_factory=dict)
     turn: AbstractContextManager[None] = field(default_factory=nullcontext)
+    report: Progress = lambda share: None
 
     @property
     def frozen(self) -> NDArray:
@@ -371,7 +375,14 @@ def simulate_in_chunks(
         effective = faulty_commands(clean, own, parts, rate=rate)
         values = {name: each[index] for name, each in (parameters or {}).items()}
         turn = turns.turn(begin // size)
-        chunk = Chunk(index, clean, effective, own, parts, rate, seed, values, turn=turn)
+
+        def report(share: float) -> None:
+            if progress is not None:
+                progress((begin + share * len(clean)) / len(commands))
+
+        chunk = Chunk(
+            index, clean, effective, own, parts, rate, seed, values, turn=turn, report=report
+        )
         try:
             nominal, healthy = run(chunk)
         finally:
@@ -389,7 +400,10 @@ def simulate_in_chunks(
 
 
 class ChunkedTwin:
-    """The base of twins that simulate some trajectories at a time, by their method `_run`."""
+    """The base of twins that simulate some trajectories at a time, by their method `_run`.
+
+    Worker processes that a chunk starts stay until all chunks are simulated.
+    """
 
     def simulate(
         self,
@@ -402,6 +416,7 @@ class ChunkedTwin:
         """See `Twin.simulate`."""
         twin: Any = self  # with the channels and the rate of the subclass
         run, emulated = twin._run, getattr(self, "emulated", False)
-        return simulate_in_chunks(
-            twin, run, commands, faults, seed=seed, progress=progress, emulated=emulated
-        )
+        with keep_workers():
+            return simulate_in_chunks(
+                twin, run, commands, faults, seed=seed, progress=progress, emulated=emulated
+            )
