@@ -43,23 +43,15 @@ def merge_bases(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any
     place = key(f"{path}:", "based_on")
     above = (*above, path.resolve())
     toml = isinstance(base, str) and Path(base).suffix.lower() == ".toml"
-    require(
-        toml or base in catalog.CASES,
-        place,
-        expected=f"the name of another case.toml, or one of {', '.join(catalog.CASES)}",
-        got=repr(base),
-        remedy="check the spelling",
-    )
+    expected = f"the name of another case.toml, or one of {', '.join(catalog.CASES)}"
+    remedy = "check the spelling"
+    require(toml or base in catalog.CASES, place, expected=expected, got=repr(base), remedy=remedy)
     if not toml:
         return settings, base
     other = path.parent / base
-    require(
-        other.resolve() not in above,
-        place,
-        expected="a case that is not based on this one",
-        got=repr(base),
-        remedy="name the case that holds all settings",
-    )
+    expected = "a case that is not based on this one"
+    remedy = "name the case that holds all settings"
+    require(other.resolve() not in above, place, expected=expected, got=repr(base), remedy=remedy)
     inner, home = merge_bases(other, above)
     for name, value in settings.items():
         old = inner.get(name)

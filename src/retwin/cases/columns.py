@@ -339,10 +339,8 @@ def _table(path: Path, records: Sequence[Record]) -> Table:
         columns[name], bad = table.numbers(name)
         if bad.any():
             row = int(np.argmax(bad))
-            raise InputError(
-                table.place,
-                expected=f"numbers in columns {', '.join(names)}",
-                got=f"{str(table.cells(name)[row])[:40]!r} in data row {row} of {name}",
-                remedy="correct that cell, or leave it empty where nothing was measured",
-            )
+            expected = f"numbers in columns {', '.join(names)}"
+            got = f"{str(table.cells(name)[row])[:40]!r} in data row {row} of {name}"
+            remedy = "correct that cell, or leave it empty where nothing was measured"
+            raise InputError(table.place, expected=expected, got=got, remedy=remedy)
     return replace(table, cells=columns.__getitem__)

@@ -233,13 +233,9 @@ def _own(name: str, folder: Path, place: str, protocol: type) -> Any:
     """An object of the user's own; of a class, one made without arguments."""
     found = imported(name, folder, place)
     found = found() if isinstance(found, type) else found
-    require(
-        fits(found, protocol),
-        place,
-        expected=f"a {protocol.__name__}",
-        got=f"{name!r}, a {type(found).__name__}",
-        remedy=f"see {protocol.__module__}.{protocol.__name__} for what it must have",
-    )
+    got = f"{name!r}, a {type(found).__name__}"
+    remedy = f"see {protocol.__module__}.{protocol.__name__} for what it must have"
+    require(fits(found, protocol), place, expected=f"a {protocol.__name__}", got=got, remedy=remedy)
     return found
 
 
@@ -271,13 +267,8 @@ def _sampler(
     """The distribution of commands: like those of a `file`, of a kind, or of the user's own."""
     if isinstance(value, str):
         return _own(value, folder, place, CommandSampler)
-    require(
-        value,
-        place,
-        expected="how commands are drawn",
-        got="nothing",
-        remedy='write file = "RECORD" for commands like recorded ones, or `kind` and its settings',
-    )
+    remedy = 'write file = "RECORD" for commands like recorded ones, or `kind` and its settings'
+    require(value, place, expected="how commands are drawn", got="nothing", remedy=remedy)
     limits: Limits | None = getattr(twin, "limits", None)
     if set(value) == {"file"}:
         return sampler_from(

@@ -142,13 +142,9 @@ class LogReader:
         steps = [np.diff(log.signals[each].times) for each in found.values()]
         medians = [float(np.median(each)) for each in steps if len(each)]
         step = float(np.median(medians)) if medians else 0.0
-        require(
-            step > 0,
-            path.name,
-            expected="times that increase",
-            got=f"a median interval of {step:g} s",
-            remedy="name the column of the times, or give the sample rate and no times",
-        )
+        got = f"a median interval of {step:g} s"
+        remedy = "name the column of the times, or give the sample rate and no times"
+        require(step > 0, path.name, expected="times that increase", got=got, remedy=remedy)
         plain = float(f"{1 / step:.3g}")
         return plain if abs(plain * step - 1) < ROUNDED else 1 / step
 
@@ -241,13 +237,10 @@ class LogReader:
         columns = self.columns
         log = self._log(path, twin.rate)
         timed = has_times(log, columns.time)
-        require(
-            timed or rows_at_rate,
-            path.name,
-            expected="a column with the times of the rows, or the sample rate",
-            got=f"columns {', '.join(log.signals)}",
-            remedy="give --time COLUMN, or --rate HZ if each row is a sample at that rate",
-        )
+        expected = "a column with the times of the rows, or the sample rate"
+        got = f"columns {', '.join(log.signals)}"
+        remedy = "give --time COLUMN, or --rate HZ if each row is a sample at that rate"
+        require(timed or rows_at_rate, path.name, expected=expected, got=got, remedy=remedy)
         mapping = mapping_by_names(log, twin, columns.names, table=_is_text(path))
         found = mapped(log, mapping, budget=Budget(path.name, self.max_bytes))
         if len(found) == 1:

@@ -89,12 +89,10 @@ def match_twin(
     except SimulationError as error:
         ends = zip(twin.inputs.names, *value_range(commands), strict=True)
         ranges = ", ".join(f"{channel} {low:.4g} to {high:.4g}" for channel, low, high in ends)
-        raise InputError(
-            name,
-            expected="commands that the twin can simulate",
-            got=f"{ranges}, with which {error}",
-            remedy="is each in the unit of the twin? Otherwise its equations or starts do not hold",
-        ) from error
+        expected = "commands that the twin can simulate"
+        got = f"{ranges}, with which {error}"
+        remedy = "is each in the unit of the twin? Otherwise its equations or starts do not hold"
+        raise InputError(name, expected=expected, got=got, remedy=remedy) from error
     return found.replace(
         commands=commands,
         nominal=nominal,
@@ -171,26 +169,20 @@ def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -
 
     """
     kept = found.maybe_healthy
-    require(
-        kept.any(),
-        "logs",
-        expected=f"a trajectory without a label, or labelled {HEALTHY}",
-        got=f"labels {', '.join(sorted(found.known_labels))}",
-        remedy="identify the parameters of a healthy system",
-    )
+    expected = f"a trajectory without a label, or labelled {HEALTHY}"
+    got = f"labels {', '.join(sorted(found.known_labels))}"
+    remedy = "identify the parameters of a healthy system"
+    require(kept.any(), "logs", expected=expected, got=got, remedy=remedy)
     if not kept.all():
         notes[f"{int((~kept).sum())} trajectories of other classes are not used."] = []
     joined = found[kept]
     _check_size(joined)
     mask = joined.mask.copy()
     mask[:, : round(transient * joined.rate)] = False
-    require(
-        mask.any() or not transient,
-        "transient",
-        expected=f"less than the {joined.steps / joined.rate:g} s of the longest trajectory",
-        got=f"{transient:g} s",
-        remedy="give a shorter transient",
-    )
+    expected = f"less than the {joined.steps / joined.rate:g} s of the longest trajectory"
+    got = f"{transient:g} s"
+    remedy = "give a shorter transient"
+    require(mask.any() or not transient, "transient", expected=expected, got=got, remedy=remedy)
     joined = joined.replace(mask=mask)
     unseen = ~joined.mask.any(axis=(0, 1))
     if unseen.any():
@@ -216,13 +208,11 @@ def _check_size(found: Trajectories, *, largest: float = 1e30) -> None:
         channels = found.outputs if name == "observed" else found.inputs
         if len(large):
             row, sample, channel = large[0]
-            raise InputError(
-                str(found.ids[row]),
-                expected=f"numbers below {largest:g}",
-                got=f"{values[row, sample, channel]:g} for {channels.names[channel]} at "
-                f"{sample / found.rate:g} s",
-                remedy="leave the cell empty, or write NaN, where a measurement is missing",
-            )
+            expected = f"numbers below {largest:g}"
+            got = f"{values[row, sample, channel]:g} for {channels.names[channel]} at "
+            got += f"{sample / found.rate:g} s"
+            remedy = "leave the cell empty, or write NaN, where a measurement is missing"
+            raise InputError(str(found.ids[row]), expected=expected, got=got, remedy=remedy)
 
 
 def _constant(found: Trajectories) -> list[str]:

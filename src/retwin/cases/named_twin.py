@@ -64,20 +64,13 @@ def imported(name: Any, folder: Path, place: str) -> Any:
         home = import_beside(module, folder)
         found = getattr(home, attribute)
     except (ImportError, AttributeError) as error:
-        raise InputError(
-            place,
-            expected=expected,
-            got=f"{name!r}: {' '.join(str(error).split())}",
-            remedy="check the spelling",
-        ) from None
+        got = f"{name!r}: {' '.join(str(error).split())}"
+        raise InputError(place, expected=expected, got=got, remedy="check the spelling") from None
     beside = folder / f"{module}.py"
     if beside.is_file() and not beside.samefile(home.__file__ or ""):
-        raise InputError(
-            place,
-            expected=f"the module {beside}",
-            got=f"another one of that name, {home.__file__}",
-            remedy="give your module a name of its own",
-        )
+        got = f"another one of that name, {home.__file__}"
+        remedy = "give your module a name of its own"
+        raise InputError(place, expected=f"the module {beside}", got=got, remedy=remedy)
     return found
 
 
@@ -112,11 +105,9 @@ def read_twin(keys: TwinKeys, folder: Path, place: str) -> Twin:
     options = dict(keys.twin) if isinstance(keys.twin, Mapping) else {"name": keys.twin}
     name = options.pop("name", None)
     if not isinstance(name, str):
+        remedy = 'write twin = "NAME", or a table with a name in it'
         raise InputError(
-            own,
-            expected=f"the name of a twin: {twins.FORMS}",
-            got=repr(keys.twin),
-            remedy='write twin = "NAME", or a table with a name in it',
+            own, expected=f"the name of a twin: {twins.FORMS}", got=repr(keys.twin), remedy=remedy
         )
     if "nominal" in options:
         options["nominal"] = imported(options["nominal"], folder, key(own, "nominal"))
@@ -230,12 +221,10 @@ def delayed_twin(twin: Twin, delays: Mapping[str, Parameter], place: str) -> Sta
     Raises InputError for a twin that is no `StateTwin`, and for commands that it does not have.
     """
     if not isinstance(twin, StateTwin):
-        raise InputError(
-            place,
-            expected="dead times of a twin that is a StateTwin",
-            got=f"those of a {type(twin).__name__}",
-            remedy="delay the commands inside the twin, with a parameter of its own",
-        )
+        expected = "dead times of a twin that is a StateTwin"
+        got = f"those of a {type(twin).__name__}"
+        remedy = "delay the commands inside the twin, with a parameter of its own"
+        raise InputError(place, expected=expected, got=got, remedy=remedy)
     with at(place):
         names = {command: each.name for command, each in delays.items()}
         parameters = (*twin.parameters, *delays.values())

@@ -122,12 +122,9 @@ def _find_file(name: str, url: str | None, sha256: str | None) -> PublicFile:
         return PublicFile(url or known.url, sha256 or known.sha256, known.file)
     plain = Path(name).name == name and name not in ("", ".", "..")
     if url is None or sha256 is None or not plain:
-        raise InputError(
-            "name",
-            expected=f"one of {', '.join(sorted(DOWNLOADS))}",
-            got=repr(name),
-            remedy="choose one of these, or give a file name with its url and sha256",
-        )
+        expected = f"one of {', '.join(sorted(DOWNLOADS))}"
+        remedy = "choose one of these, or give a file name with its url and sha256"
+        raise InputError("name", expected=expected, got=repr(name), remedy=remedy)
     return PublicFile(url, sha256, name)
 
 

@@ -124,12 +124,9 @@ def rows_of(
     try:
         yield from csv.reader(lines, delimiter=separator, strict=strict)
     except csv.Error as error:
-        raise InputError(
-            place,
-            expected="a table of text",
-            got=brief(error),
-            remedy="check quotation marks, and that it is the right file",
-        ) from None
+        expected = "a table of text"
+        remedy = "check quotation marks, and that it is the right file"
+        raise InputError(place, expected=expected, got=brief(error), remedy=remedy) from None
 
 
 def text_layout(

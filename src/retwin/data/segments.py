@@ -60,12 +60,10 @@ class Segments:
         following = self.stop[:, :-1] <= self.start[:, 1:]
         if not (ordered.all() and following.all()):
             wrong = ~(ordered.all(axis=1) & following.all(axis=1))
-            raise InputError(
-                "segments",
-                expected="start <= settle <= stop <= next start in every trajectory",
-                got=f"trajectory {int(np.argmax(wrong))} out of order",
-                remedy="sort the segments by time and let none overlap",
-            )
+            expected = "start <= settle <= stop <= next start in every trajectory"
+            got = f"trajectory {int(np.argmax(wrong))} out of order"
+            remedy = "sort the segments by time and let none overlap"
+            raise InputError("segments", expected=expected, got=got, remedy=remedy)
 
     def __len__(self) -> int:
         return len(self.start)
@@ -122,12 +120,10 @@ class Segments:
         valid = np.isfinite(start) & np.isfinite(settle)
         outside = valid & ((start < 0) | (settle > steps))
         if outside.any():
-            raise InputError(
-                "segments",
-                expected=f"times between 0 and {steps / rate:g} s",
-                got=f"{start[outside][0] / rate:g} to {settle[outside][0] / rate:g} s",
-                remedy="give onsets and settle times in seconds, not samples",
-            )
+            expected = f"times between 0 and {steps / rate:g} s"
+            got = f"{start[outside][0] / rate:g} to {settle[outside][0] / rate:g} s"
+            remedy = "give onsets and settle times in seconds, not samples"
+            raise InputError("segments", expected=expected, got=got, remedy=remedy)
         start = np.where(valid, start, steps)
         settle = np.where(valid, settle, steps)
         stop = np.concatenate([start[:, 1:], np.full((len(start), 1), float(steps))], axis=1)

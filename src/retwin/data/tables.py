@@ -250,12 +250,10 @@ def _blocks(path: Path, layout: Layout, *, empty: bool, strict: bool) -> Iterato
             try:
                 block.append(layout.whole(row))
             except ValueError:
-                raise InputError(
-                    path.name,
-                    expected=f"{len(layout.names)} cells in every row, as in its header",
-                    got=f"{len(row)} in line {number}",
-                    remedy="repair or remove that line; the last one of a log may be cut off",
-                ) from None
+                expected = f"{len(layout.names)} cells in every row, as in its header"
+                got = f"{len(row)} in line {number}"
+                remedy = "repair or remove that line; the last one of a log may be cut off"
+                raise InputError(path.name, expected=expected, got=got, remedy=remedy) from None
             if len(block) == BLOCK:
                 yield block
                 block = []

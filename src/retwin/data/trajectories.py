@@ -147,13 +147,10 @@ class Trajectories:
         n = len(commands)
         labels = named("labels", self.labels, [UNLABELLED] * n)
         ids = named("ids", self.ids, [f"{i:05d}" for i in range(n)])
-        require(
-            len(set(ids.tolist())) == n,
-            "ids",
-            expected="one unique name per trajectory",
-            got="a name that repeats",
-            remedy="leave ids out to have them numbered",
-        )
+        expected = "one unique name per trajectory"
+        got = "a name that repeats"
+        remedy = "leave ids out to have them numbered"
+        require(len(set(ids.tolist())) == n, "ids", expected=expected, got=got, remedy=remedy)
         inputs = self.inputs or Channels.numbered("u", commands.shape[2])
         outputs = self.outputs or Channels.numbered("y", nominal.shape[2])
         for name, channels, width in (
@@ -299,24 +296,17 @@ class Trajectories:
 
         """
         first, second = self.split_index(fraction, seed=seed)
-        require(
-            len(first) and len(second),
-            "fraction",
-            expected=f"a share that leaves some of the {len(self)} trajectories to both sets",
-            got=f"{fraction!r}, which gives {len(first)} and {len(second)}",
-            remedy="give another share, or more trajectories",
-        )
+        expected = f"a share that leaves some of the {len(self)} trajectories to both sets"
+        got = f"{fraction!r}, which gives {len(first)} and {len(second)}"
+        remedy = "give another share, or more trajectories"
+        require(len(first) and len(second), "fraction", expected=expected, got=got, remedy=remedy)
         return self[first], self[second]
 
     def split_index(self, fraction: float, *, seed: int) -> tuple[NDArray, NDArray]:
         """The sorted indices of the two sets that `split` gives."""
-        require(
-            0 < fraction < 1,
-            "fraction",
-            expected="a number strictly between 0 and 1",
-            got=repr(fraction),
-            remedy="give the share of the first part",
-        )
+        expected = "a number strictly between 0 and 1"
+        remedy = "give the share of the first part"
+        require(0 < fraction < 1, "fraction", expected=expected, got=repr(fraction), remedy=remedy)
         rng = np.random.default_rng(seed)
         first = np.zeros(len(self), dtype=bool)
         taken = 0.0

@@ -285,10 +285,7 @@ def _check_classes(case: Case, plan: StudyPlan, twin: Trajectories) -> None:
     """Require trajectories of the twin of every class, if a source learns the classes from them."""
     learning = [name for name in plan.sources if SOURCES[name].recorded]
     absent = [label for label in case.classes if label not in twin.known_labels]
-    require(
-        not (learning and absent),
-        "twin-data",
-        expected=f"trajectories of every class, from which {', '.join(learning)} would learn them",
-        got=f"none of {', '.join(absent)}",
-        remedy="add them, or leave these sources out: the others need healthy trajectories only",
-    )
+    expected = f"trajectories of every class, from which {', '.join(learning)} would learn them"
+    got = f"none of {', '.join(absent)}"
+    remedy = "add them, or leave these sources out: the others need healthy trajectories only"
+    require(not (learning and absent), "twin-data", expected=expected, got=got, remedy=remedy)

@@ -111,12 +111,9 @@ def real_data(
         seed = plan.seed_of("emulated", 0)
         real = _emulate(case, plan.emulated_healthy, seed)
     else:
-        raise InputError(
-            "real data",
-            expected="measured trajectories",
-            got=f"none, and the case {case.name!r} has no emulator",
-            remedy="give --real FILE --folds K",
-        )
+        got = f"none, and the case {case.name!r} has no emulator"
+        remedy = "give --real FILE --folds K"
+        raise InputError("real data", expected="measured trajectories", got=got, remedy=remedy)
     # Copies have no role: a fold would be tested by what the others were calibrated on.
     first = distinct_records(real.measured)
     folds = real[first].folds(plan.folds, seed=plan.seed_of("folds", 0))

@@ -48,12 +48,9 @@ class DiagnoserSubject:
 
     def __post_init__(self) -> None:
         if len(self.trajectories) < 2:
-            raise InputError(
-                "trajectories",
-                expected="at least two",
-                got=f"{len(self.trajectories)}",
-                remedy="give a few of the kind on which the diagnoser was fitted",
-            )
+            got = f"{len(self.trajectories)}"
+            remedy = "give a few of the kind on which the diagnoser was fitted"
+            raise InputError("trajectories", expected="at least two", got=got, remedy=remedy)
 
     def predict(self, trajectories: Trajectories | None = None) -> NDArray:
         """Probabilities (n, classes), by default of the subject's trajectories."""

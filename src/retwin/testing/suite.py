@@ -57,12 +57,7 @@ def require_same(got: NDArray, wanted: NDArray, message: str) -> None:
 
 
 def require_alike(
-    got: ArrayLike,
-    wanted: ArrayLike,
-    message: str,
-    *,
-    tolerance: float = 1e-5,
-    floor: float = 1e-6,
+    got: ArrayLike, wanted: ArrayLike, message: str, *, tolerance: float = 1e-5, floor: float = 1e-6
 ) -> None:
     """Assert that two arrays are equal up to rounding.
 

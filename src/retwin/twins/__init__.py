@@ -157,12 +157,10 @@ def _of_function(
 ) -> Twin:
     """The twin of a function, whose channels have the unit "1"."""
     if not inputs or not outputs or not rate:
-        raise InputError(
-            f"twin {name!r}",
-            expected="inputs, outputs and rate, which a function does not have",
-            got=f"inputs {list(inputs)}, outputs {list(outputs)}, rate {rate}",
-            remedy="name the channels and the rate, or name an object that is a FunctionTwin",
-        )
+        expected = "inputs, outputs and rate, which a function does not have"
+        got = f"inputs {list(inputs)}, outputs {list(outputs)}, rate {rate}"
+        remedy = "name the channels and the rate, or name an object that is a FunctionTwin"
+        raise InputError(f"twin {name!r}", expected=expected, got=got, remedy=remedy)
     from retwin.twins.function import FunctionTwin
 
     _check_one_array(name, function, inputs)
@@ -177,13 +175,11 @@ def _check_one_array(name: str, function: Callable[..., Any], inputs: Sequence[s
         signature.bind(0, **{each: 0 for each in ("rng", "rate") if each in signature.parameters})
     except TypeError as error:
         passed = ", ".join(f"{each}=u[..., {i}]" for i, each in enumerate(inputs))
-        raise InputError(
-            f"twin {name!r}",
-            expected="a function of one array of commands u, (n, T, d_u), and of numbers with "
-            "defaults",
-            got=f"{name.rpartition(':')[2]}{signature}, {error}",
-            remedy=f"name a function of u that calls it by names, with {passed}",
-        ) from None
+        expected = "a function of one array of commands u, (n, T, d_u), and of numbers with "
+        expected += "defaults"
+        got = f"{name.rpartition(':')[2]}{signature}, {error}"
+        remedy = f"name a function of u that calls it by names, with {passed}"
+        raise InputError(f"twin {name!r}", expected=expected, got=got, remedy=remedy) from None
     except ValueError:  # some compiled functions have no signature
         return
 

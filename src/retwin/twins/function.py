@@ -211,13 +211,11 @@ class _Call:
         bad = ~np.isfinite(outputs)
         if bad.any():
             row, sample, channel = np.argwhere(bad)[0]
-            raise InputError(
-                self.role,
-                expected=f"{_name(self.function)} to return finite numbers",
-                got=f"{outputs[row, sample, channel]} for {self.twin.outputs.names[channel]} in "
-                f"trajectory {self.ids[row]}, sample {sample}",
-                remedy="repair the function, or give limits that exclude such commands",
-            )
+            expected = f"{_name(self.function)} to return finite numbers"
+            got = f"{outputs[row, sample, channel]} for {self.twin.outputs.names[channel]} in "
+            got += f"trajectory {self.ids[row]}, sample {sample}"
+            remedy = "repair the function, or give limits that exclude such commands"
+            raise InputError(self.role, expected=expected, got=got, remedy=remedy)
 
 
 def _outputs(calls: Sequence[_Call], pool: ProcessPool | None, chunk: Chunk) -> Iterator[NDArray]:
@@ -231,12 +229,9 @@ def _outputs(calls: Sequence[_Call], pool: ProcessPool | None, chunk: Chunk) -> 
         try:
             yield future.result()
         except BrokenProcessPool as error:
-            raise InputError(
-                "workers",
-                expected="worker processes that can start",
-                got=str(error),
-                remedy="call it from a script, under `if __name__ == '__main__':`, or workers=1",
-            ) from error
+            expected = "worker processes that can start"
+            remedy = "call it from a script, under `if __name__ == '__main__':`, or workers=1"
+            raise InputError("workers", expected=expected, got=str(error), remedy=remedy) from error
         except ProcessExpired as error:
             chunk.failed[int(call.ids[0]) - chunk.index.start] = (
                 f"the process of {_name(call.function)} died, exit code {error.exitcode}"

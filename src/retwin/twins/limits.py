@@ -86,12 +86,10 @@ class Limits:
             beyond = (commands[rows] < low) | (commands[rows] > high)
             if beyond.any():
                 trajectory, sample, channel = np.argwhere(beyond)[0] + (rows.start, 0, 0)
-                raise InputError(
-                    "commands",
-                    expected=f"{inputs.names[channel]} from {low[channel]:g} to {high[channel]:g} "
-                    f"{inputs.units[channel]}",
-                    got=f"{commands[trajectory, sample, channel]:g} in trajectory {trajectory}, "
-                    f"sample {sample}",
-                    remedy="keep the limits, or have commands clipped (outside='clip', or --clip)",
-                )
+                expected = f"{inputs.names[channel]} from {low[channel]:g} to {high[channel]:g} "
+                expected += f"{inputs.units[channel]}"
+                got = f"{commands[trajectory, sample, channel]:g} in trajectory {trajectory}, "
+                got += f"sample {sample}"
+                remedy = "keep the limits, or have commands clipped (outside='clip', or --clip)"
+                raise InputError("commands", expected=expected, got=got, remedy=remedy)
         return commands

@@ -154,12 +154,10 @@ class _Scene:
             self._model = _compile(stage)
             self._addresses = [self._model.joint(name).qposadr[0] for name in stage.joints]
         except (ValueError, KeyError) as error:
-            raise InputError(
-                "model",
-                expected=f"an MJCF file with the joints {', '.join(stage.joints)}",
-                got=f"{stage.model} ({brief(error)})",
-                remedy="make the body's model and its joints agree",
-            ) from None
+            expected = f"an MJCF file with the joints {', '.join(stage.joints)}"
+            got = f"{stage.model} ({brief(error)})"
+            remedy = "make the body's model and its joints agree"
+            raise InputError("model", expected=expected, got=got, remedy=remedy) from None
         self._data = mujoco.MjData(self._model)
         camera = stage.camera
         self._renderer = mujoco.Renderer(self._model, camera.size[1], camera.size[0])

@@ -74,13 +74,9 @@ class ArmBody:
             ("commands", len(trajectories.inputs), self.twin.arm.joints),
             ("outputs", len(trajectories.outputs), 3),
         ):
-            require(
-                has == needs,
-                name,
-                expected=f"{needs} channels, those of the arm",
-                got=has,
-                remedy="load the file with the arm's case, which completes commands",
-            )
+            expected = f"{needs} channels, those of the arm"
+            remedy = "load the file with the arm's case, which completes commands"
+            require(has == needs, name, expected=expected, got=has, remedy=remedy)
         nominal = self.twin.angles(trajectories.commands.astype(float))
         return nominal, nearest_poses(self.twin.arm, nominal, _interpolate(trajectories))
 

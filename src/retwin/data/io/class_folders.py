@@ -57,25 +57,18 @@ def read_class_folders(
     kinds: list[tuple[str, Reader]] = [("*.csv", _read_csv), ("dataset_*.mat", _read_dataset)]
     found = [(_in_order(path, pattern), read) for pattern, read in kinds]
     found = [(files, read) for files, read in found if files]
-    require(
-        len(found) == 1,
-        "path",
-        expected="a folder per class with *.csv or dataset_*.mat files",
-        got=f"{'both kinds' if found else 'no such file'} in {path}",
-        remedy="keep the kinds apart" if found else "give the folder above the class folders",
-    )
+    expected = "a folder per class with *.csv or dataset_*.mat files"
+    got = f"{'both kinds' if found else 'no such file'} in {path}"
+    remedy = "keep the kinds apart" if found else "give the folder above the class folders"
+    require(len(found) == 1, "path", expected=expected, got=got, remedy=remedy)
     files, read = found[0]
     raws, budget = [], Budget(path.name, max_bytes)
     with mat_reader() as reader:
         for file in tracked(files, len(files), progress):
             where = f"{file.parent.name}/{file.name}"
-            require(
-                file.is_file(),
-                where,
-                expected="a regular file",
-                got="a pipe, a device or a folder",
-                remedy="keep nothing else of that name there",
-            )
+            got = "a pipe, a device or a folder"
+            remedy = "keep nothing else of that name there"
+            require(file.is_file(), where, expected="a regular file", got=got, remedy=remedy)
             raws.append(read(file, where, case, budget, reader))
     raws, inputs = _commands_of_case(raws, case, radians=read is _read_dataset)
     source = Provenance(path.resolve().name, sha256(path))
@@ -116,13 +109,9 @@ def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget, _: 
             if len(fields) != width:
                 got = f"{len(fields)} columns in line {number} after {width} before"
                 break
-    require(
-        not got,
-        where,
-        expected="rows of numbers with commas between, all of one length, without a header",
-        got=got,
-        remedy="repair that line ('nan' stands for a missing measurement)",
-    )
+    expected = "rows of numbers with commas between, all of one length, without a header"
+    remedy = "repair that line ('nan' stands for a missing measurement)"
+    require(not got, where, expected=expected, got=got, remedy=remedy)
     block = np.frombuffer(values).reshape(-1, width)
     return Raw.of_columns(block, where, case, label, f"{label}/{file.stem}")
 
@@ -223,13 +212,10 @@ def _series(
     times = _vector(cell["Time"], where)
     periods = np.diff(times)
     growing = len(periods) and np.all(np.isfinite(periods) & (periods > 0))
-    require(
-        len(times) == len(data) and growing,
-        where,
-        expected="one growing time per value",
-        got=f"{len(times)} times for {len(data)} values, or times that do not grow",
-        remedy="repair the Time of the motor commands",
-    )
+    expected = "one growing time per value"
+    got = f"{len(times)} times for {len(data)} values, or times that do not grow"
+    remedy = "repair the Time of the motor commands"
+    require(len(times) == len(data) and growing, where, expected=expected, got=got, remedy=remedy)
     require(
         periods.max() <= period_ratio * periods.min(),
         where,

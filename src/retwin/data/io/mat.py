@@ -46,14 +46,11 @@ def read_mat(
     with mat_reader() as reader:
         variables = mat_variables(path, budget, reader)
     found = [pair for pair in PAIRS if set(pair) <= set(variables)]
-    require(
-        len(found) == 1,
-        path.name,
-        expected=" or ".join(f"{x} with {y}" for x, y in PAIRS) + ", one pair of them",
-        got=f"the variables {', '.join(sorted(variables)) or 'none'}",
-        remedy="save trajectories and class names under these names; for dataset_*.mat files "
-        "give the folder that holds one folder per class",
-    )
+    expected = " or ".join(f"{x} with {y}" for x, y in PAIRS) + ", one pair of them"
+    got = f"the variables {', '.join(sorted(variables)) or 'none'}"
+    remedy = "save trajectories and class names under these names; for dataset_*.mat files "
+    remedy += "give the folder that holds one folder per class"
+    require(len(found) == 1, path.name, expected=expected, got=got, remedy=remedy)
     (x_name, y_name) = found[0]
     blocks = _cells(variables[x_name], f"{path.name}: {x_name}")
     labels = _cells(variables[y_name], f"{path.name}: {y_name}")
@@ -110,12 +107,10 @@ def send_variables(request: dict[str, Any]) -> Iterator[Frame]:
     try:
         found = loadmat(path, variable_names=request["names"])
     except NotImplementedError:  # scipy's error for HDF5
-        raise InputError(
-            path.name,
-            expected="a MAT file of version 5 to 7",
-            got="one of version 7.3 (HDF5) or newer",
-            remedy="save it in MATLAB with the option '-v7'",
-        ) from None
+        expected = "a MAT file of version 5 to 7"
+        got = "one of version 7.3 (HDF5) or newer"
+        remedy = "save it in MATLAB with the option '-v7'"
+        raise InputError(path.name, expected=expected, got=got, remedy=remedy) from None
     for name, value in found.items():
         if not name.startswith("__"):
             arrays: list[NDArray] = []

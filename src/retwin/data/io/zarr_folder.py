@@ -82,12 +82,10 @@ class Scratch:
             while rest:
                 rest = rest[self._file.write(rest) :]
         except OSError as error:
-            raise InputError(
-                "TMPDIR",
-                expected="a folder for temporary files with room for all numbers of the set",
-                got=f"{tempfile.gettempdir()} ({error.strerror or error})",
-                remedy="set TMPDIR to a folder on a larger disk, or read a part of the set",
-            ) from error
+            expected = "a folder for temporary files with room for all numbers of the set"
+            got = f"{tempfile.gettempdir()} ({error.strerror or error})"
+            remedy = "set TMPDIR to a folder on a larger disk, or read a part of the set"
+            raise InputError("TMPDIR", expected=expected, got=got, remedy=remedy) from error
         self._count += len(rows)
 
     def array(self) -> NDArray:
@@ -322,13 +320,9 @@ def _check_size(array: Any, shape: list[int], chunk: int, where: str, *, copies:
     )
     # Other codecs may unpack a small file to any size.
     codecs = [type(codec).__name__ for codec in array.metadata.codecs]
-    require(
-        codecs == CODECS,
-        where,
-        expected=f"numbers that are packed by {' and '.join(CODECS)}",
-        got=", ".join(codecs),
-        remedy="the folder is damaged: get or make it again",
-    )
+    expected = f"numbers that are packed by {' and '.join(CODECS)}"
+    remedy = "the folder is damaged: get or make it again"
+    require(codecs == CODECS, where, expected=expected, got=", ".join(codecs), remedy=remedy)
     Budget(where).take(copies * math.prod(chunks) * array.dtype.itemsize)
 
 

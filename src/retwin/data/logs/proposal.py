@@ -211,12 +211,9 @@ def proposed(
         for each in facts:
             if not each.constant:
                 in_order(log.signals[each.name], log.name)  # its times repeat: says so
-        raise InputError(
-            log.name,
-            expected="signals that change",
-            got=f"{len(facts)} that are constant or have one value",
-            remedy="check that it is the right log",
-        )
+        got = f"{len(facts)} that are constant or have one value"
+        remedy = "check that it is the right log"
+        raise InputError(log.name, expected="signals that change", got=got, remedy=remedy)
     chosen = _by_name(moving) if case is None else _for_case(moving, case)
     by_unit = _add_by_unit(chosen, moving, units_of(case))
     used = [fact for table in chosen.values() for fact in table.values() if fact is not None]

@@ -167,13 +167,10 @@ class _Job:
                     np.save(new / "commands.npy", plan.commands.array)
                 create_chunked(new / "data", _header(plan, {}, []), plan.dtype)
                 write_json(new / "plan.json", about)
-        require(
-            (part / "plan.json").exists(),
-            "path",
-            expected=f"{part} to be free, or to hold an interrupted job",
-            got="something else there",
-            remedy="give another name, or remove it",
-        )
+        expected = f"{part} to be free, or to hold an interrupted job"
+        got = "something else there"
+        remedy = "give another name, or remove it"
+        require((part / "plan.json").exists(), "path", expected=expected, got=got, remedy=remedy)
         _check_same(part, json.loads((part / "plan.json").read_text("utf-8")), about)
         if isinstance(plan.commands, Recorded):
             plan = replace(plan, commands=Recorded(part / "commands.npy"))

@@ -84,12 +84,10 @@ class Rocket:
         of modern neural networks", ICML 2017).
         """
         trajectories, report = task.trajectories, task.progress or (lambda _: None)
+        expected = "none for Rocket, whose weights have a closed form"
+        remedy = "leave it out"
         require(
-            task.training is None,
-            "training",
-            expected="none for Rocket, whose weights have a closed form",
-            got=task.training,
-            remedy="leave it out",
+            task.training is None, "training", expected=expected, got=task.training, remedy=remedy
         )
         order = class_order(trajectories, task.classes)
         features = Features.at(trajectories, task.rate)

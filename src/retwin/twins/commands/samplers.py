@@ -343,13 +343,10 @@ class RecordedSampler(Timed):
         longest = shape[1] / sample_rate("rate", self.rate)
         object.__setattr__(self, "duration", float(self.duration or longest))
         self.check_steps()
-        require(
-            self.steps <= shape[1],
-            "duration",
-            expected=f"at most {longest:g} s, the duration of the records",
-            got=f"{self.duration:g} s",
-            remedy="give shorter pieces",
-        )
+        expected = f"at most {longest:g} s, the duration of the records"
+        got = f"{self.duration:g} s"
+        remedy = "give shorter pieces"
+        require(self.steps <= shape[1], "duration", expected=expected, got=got, remedy=remedy)
 
     def sample(
         self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None

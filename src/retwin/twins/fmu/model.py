@@ -212,12 +212,10 @@ def find_scalars(description: Any, argument: str, names: Sequence[str]) -> list[
         if name not in found:
             every = {variable.name: variable for variable in description.modelVariables}
             local = " or local" if causality == "output" else ""
-            raise InputError(
-                argument,
-                expected=f"variables that are an {causality}{local} and a number",
-                got=f"{name!r}, {_description(every.get(name))}",
-                remedy=_close_matches(name, found),
-            )
+            expected = f"variables that are an {causality}{local} and a number"
+            got = f"{name!r}, {_description(every.get(name))}"
+            remedy = _close_matches(name, found)
+            raise InputError(argument, expected=expected, got=got, remedy=remedy)
         chosen.append(found[name])
     return chosen
 
@@ -356,13 +354,9 @@ def start_column(
 
     """
     able = {each: v for each, v in _settable(description).items() if each not in inputs}
-    require(
-        name in able,
-        "start",
-        expected="scalar variables that can be set before a run, and are no commands",
-        got=repr(name),
-        remedy=_close_matches(name, able),
-    )
+    expected = "scalar variables that can be set before a run, and are no commands"
+    remedy = _close_matches(name, able)
+    require(name in able, "start", expected=expected, got=repr(name), remedy=remedy)
     kind = able[name].type
     array = np.asarray(value)
     fits = array.shape in ((), (count,)) and array.dtype.kind in (

@@ -345,13 +345,10 @@ class FMUTwin:
         """Refuse an FMU that cannot be loaded, once instead of in every run."""
         loading = pool.schedule(f"{TASKS}:load", None, timeout=self.timeout, size=0)
         reason = self._outcome(loading).reason
-        require(
-            not reason,
-            "path",
-            expected="an FMU that loads on this machine",
-            got=f"{self.path.name}: {reason}",
-            remedy="export it for this system; see that what it needs is installed",
-        )
+        expected = "an FMU that loads on this machine"
+        got = f"{self.path.name}: {reason}"
+        remedy = "export it for this system; see that what it needs is installed"
+        require(not reason, "path", expected=expected, got=got, remedy=remedy)
 
     def _start_values(
         self, description: Any, parameters: Mapping[str, ArrayLike], count: int

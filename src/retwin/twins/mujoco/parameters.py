@@ -100,12 +100,10 @@ def _parts(name: str) -> Iterator[tuple[re.Match[str], int]]:
     except InputError:
         raise
     except (KeyError, AttributeError, ValueError, IndexError, TypeError) as error:
-        raise InputError(
-            "parameters",
-            expected='"KIND.NAME.FIELD[INDEX]" as in "joint.hip.damping", or "opt.FIELD[INDEX]"',
-            got=f"{name!r} ({' '.join(str(error.args[0]).split())})",
-            remedy="name a body, joint, actuator, … of the model and one of its number fields",
-        ) from None
+        expected = '"KIND.NAME.FIELD[INDEX]" as in "joint.hip.damping", or "opt.FIELD[INDEX]"'
+        got = f"{name!r} ({' '.join(str(error.args[0]).split())})"
+        remedy = "name a body, joint, actuator, … of the model and one of its number fields"
+        raise InputError("parameters", expected=expected, got=got, remedy=remedy) from None
 
 
 def set_parameter(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None:
