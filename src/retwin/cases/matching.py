@@ -16,6 +16,8 @@ from retwin.twins.collected import SimulationError
 from retwin.twins.twin import Twin
 from retwin.update.forecast_errors import value_range
 
+Notes = dict[str, list[str]]
+"""What was done while logs were read, and the names of the files to which that applies."""
 CONSTANT = "constant in what was read, which therefore shows no dynamics of it."
 """What is noted of channels that never change."""
 
@@ -25,7 +27,7 @@ def match_twin(
     twin: Twin,
     names: Mapping[str, str],
     name: str,
-    notes: dict[str, list[str]],
+    notes: Notes,
     *,
     mapped: bool = False,
 ) -> Trajectories:
@@ -125,7 +127,7 @@ def _columns(
     places: Sequence[int | None],
     wanted: Channels,
     name: str,
-    notes: dict[str, list[str]],
+    notes: Notes,
 ) -> NDArray:
     """Values (n, T, d) of the channels of the twin in its units; 0 of those that are not there."""
     made = np.zeros((*values.shape[:2], len(places)))
@@ -150,7 +152,7 @@ def _units_taken(own: Channels, wanted: Channels, places: Sequence[int | None]) 
     ]
 
 
-def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -> Trajectories:
+def usable(found: Trajectories, notes: Notes, transient: float) -> Trajectories:
     """The healthy and the unlabelled trajectories, without their outputs in the first seconds.
 
     Parameters

@@ -177,21 +177,12 @@ def _making(options: dict[str, Any], place: str, *names: str) -> _Making:
     return from_settings(_Making, {n: options.pop(n) for n in names if n in options}, place=place)
 
 
-def _channels(
-    given: Mapping[str, Any] | Sequence[str], place: str, *, max_channels: int = 10000
-) -> dict[str, _Channel]:
-    """A table of each channel, for which its name alone may stand.
-
-    Parameters
-    ----------
-    max_channels : int, default 10000
-        Largest number of inputs, and of outputs, in a case.toml: more take minutes to read, and a
-        trajectory takes hundreds of MB.
-
-    """
+def _channels(given: Mapping[str, Any] | Sequence[str], place: str) -> dict[str, _Channel]:
+    """A table of each channel, for which its name alone may stand."""
     tables = given if isinstance(given, Mapping) else {name: {} for name in given}
     remedy = "leave out those that are constant, or split the system"
-    at_most(place, len(tables), max_channels, "channels", remedy=remedy)
+    # More take minutes to read, and a trajectory takes hundreds of MB.
+    at_most(place, len(tables), 10_000, "channels", remedy=remedy)
     return {
         name: from_settings(_Channel, value, place=key(place, name))
         for name, value in tables.items()

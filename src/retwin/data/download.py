@@ -128,22 +128,14 @@ def _find_file(name: str, url: str | None, sha256: str | None) -> PublicFile:
     return PublicFile(url, sha256, name)
 
 
-def _download(
-    transfer: Transfer, progress: Progress | None, *, seconds_per_report: float = 0.1
-) -> None:
-    """Wait for a transfer, for `MAX_SECONDS` at most.
-
-    Parameters
-    ----------
-    seconds_per_report : float, default 0.1
-        Time between two looks at the transfer.
-
-    """
+def _download(transfer: Transfer, progress: Progress | None) -> None:
+    """Wait for a transfer, for `MAX_SECONDS` at most."""
     deadline = time.monotonic() + MAX_SECONDS
     transfer.start()
     try:
         while transfer.is_alive():
-            transfer.join(seconds_per_report)
+            # Time between two looks at the transfer.
+            transfer.join(0.1)
             if progress is not None and transfer.share:
                 progress(transfer.share)
             if time.monotonic() > deadline:

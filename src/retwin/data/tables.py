@@ -105,18 +105,10 @@ class Table:
         """The cells of a column of times, their unit, and the column for messages."""
         return self.cells(name), self.units[name] or unit_in(name), f"{self.place}, column {name!r}"
 
-    def signals(
-        self, clock: Clock, wanted: frozenset[str] | None, *, text_share: float = 0.5
-    ) -> Iterator[Signal | Skipped]:
+    def signals(self, clock: Clock, wanted: frozenset[str] | None) -> Iterator[Signal | Skipped]:
         """The signals of the columns that are wanted, of all where that is None.
 
         Raises InputError where there is no column of times, or it holds something else.
-
-        Parameters
-        ----------
-        text_share : float, default 0.5
-            The share of cells that are no numbers from which a column is text.
-
         """
         if wanted is None and not (clock.column or clock.rate or clock.otherwise):
             clock = Clock(self._likely_times(), clock.unit, clock.format)
@@ -136,7 +128,8 @@ class Table:
                 yield Skipped(title, self.others[title])
             else:
                 values, bad = self.numbers(title)
-                text = self.rows and bad.sum() > text_share * self.rows
+                # The share of cells that are no numbers from which a column is text.
+                text = self.rows and bad.sum() > 0.5 * self.rows
                 yield (
                     Skipped(title, "text")
                     if text

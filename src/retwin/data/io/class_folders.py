@@ -193,17 +193,8 @@ def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None,
     return np.stack(vectors, axis=1), next(iter(rates), None)
 
 
-def _series(
-    cell: Any, where: str, *, period_ratio: float = 1.5
-) -> tuple[NDArray | None, float | None]:
-    """Values (T,) and sample rate (Hz) of one motor; None for what cannot be decoded.
-
-    Parameters
-    ----------
-    period_ratio : float, default 1.5
-        The largest ratio of two sample periods that count as jitter: one sample less makes it 2.
-
-    """
+def _series(cell: Any, where: str) -> tuple[NDArray | None, float | None]:
+    """Values (T,) and sample rate (Hz) of one motor; None for what cannot be decoded."""
     if cell is None:
         return None, None
     data = _vector(cell.get("Data") if isinstance(cell, dict) else cell, where)
@@ -216,8 +207,9 @@ def _series(
     got = f"{len(times)} times for {len(data)} values, or times that do not grow"
     remedy = "repair the Time of the motor commands"
     require(len(times) == len(data) and growing, where, expected=expected, got=got, remedy=remedy)
+    # The largest ratio of two sample periods that count as jitter: one sample less makes it 2.
     require(
-        periods.max() <= period_ratio * periods.min(),
+        periods.max() <= 1.5 * periods.min(),
         where,
         expected="a constant sample rate",
         got=f"steps from {periods.min():g} to {periods.max():g} s",

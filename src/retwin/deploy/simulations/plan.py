@@ -292,17 +292,6 @@ def _simulated(
                 raise
             made, failed = error.finished, dict(error.failed)
             good = np.array([int(each) for each in made.ids], dtype=int)
-    return _stored(plan, rows, commands, made, good, failed)
-
-
-def _stored(
-    plan: SimulationPlan,
-    rows: NDArray,
-    commands: NDArray,
-    made: Trajectories,
-    good: NDArray,
-    failed: dict[int, str],
-) -> SimulatedChunk:
     classes, width = rows % len(plan.faults), len(plan.twin.outputs)
     require(
         made.observed.shape == (len(good), plan.steps, width),

@@ -198,17 +198,8 @@ class RocketDiagnoser:
         return cls(features, names, about["samples"], weights, about["figures"])
 
 
-def _ridge(
-    convolved: NDArray, labels: NDArray, order: tuple[str, ...], *, absent: float = -2.0
-) -> tuple[NDArray, NDArray]:
-    """Slope (classes, kernels) and level (classes,) of the scores of the classes in `order`.
-
-    Parameters
-    ----------
-    absent : float, default -2.0
-        Score of a class that has no training example; scores of the others are near -1 and 1.
-
-    """
+def _ridge(convolved: NDArray, labels: NDArray, order: tuple[str, ...]) -> tuple[NDArray, NDArray]:
+    """Slope (classes, kernels) and level (classes,) of the scores of the classes in `order`."""
     from sklearn.linear_model import RidgeCV
     from sklearn.preprocessing import StandardScaler
 
@@ -216,7 +207,8 @@ def _ridge(
     scaler = StandardScaler().fit(convolved)
     ridge = RidgeCV(alphas=PENALTIES).fit(scaler.transform(convolved), 2.0 * truth - 1)
     slope = ridge.coef_ / scaler.scale_
-    return slope, np.where(truth.any(axis=0), ridge.intercept_ - slope @ scaler.mean_, absent)
+    # Score of a class that has no training example; scores of the others are near -1 and 1.
+    return slope, np.where(truth.any(axis=0), ridge.intercept_ - slope @ scaler.mean_, -2.0)
 
 
 def _temperature(scores: NDArray, truth: NDArray) -> tuple[float, float]:
