@@ -82,13 +82,10 @@ def updated_built_in(base: str, settings: Mapping[str, Any], place: str) -> Case
     inside = key(place, "parameters")
     for name in keys.parameters:
         one_of(key(inside, name), name, names)
-    require(
-        keys.parameters and made.parametric is not None,
-        inside,
-        expected=f"some of {', '.join(names) or 'none, since the case has no parameters'}",
-        got="none",
-        remedy=f'give "{base}" itself where a case is wanted',
-    )
+    fits = keys.parameters and made.parametric is not None
+    expected = f"some of {', '.join(names) or 'none, since the case has no parameters'}"
+    remedy = f'give "{base}" itself where a case is wanted'
+    require(fits, inside, expected=expected, got="none", remedy=remedy)
     assert made.parametric is not None
     with at(place):
         twin = made.parametric.freed(parameters_of(keys.parameters, inside))

@@ -334,13 +334,10 @@ def _checked_split(
     """The records that a user's function gives, checked."""
     made = function(Path(path))
     fine = isinstance(made, tuple) and len(made) == 2
-    require(
-        fine and all(isinstance(each, Trajectories) for each in made),
-        place,
-        expected="a function that returns two Trajectories, for calibration and for tests",
-        got=f"one that returned {made!r:.80}",
-        remedy="return (calibration, test)",
-    )
+    fine = fine and all(isinstance(each, Trajectories) for each in made)
+    expected = "a function that returns two Trajectories, for calibration and for tests"
+    got = f"one that returned {made!r:.80}"
+    require(fine, place, expected=expected, got=got, remedy="return (calibration, test)")
     for each in made:
         remedy = "give them the channels and the rate of the twin"
         agree(place, each, twin, "that of the twin", remedy=remedy)

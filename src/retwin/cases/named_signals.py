@@ -144,13 +144,10 @@ def signals_of(log: Log, channels: Iterable[str], named: Mapping[str, str]) -> d
         ending = [each for each in log.signals if each.endswith((f"/{plain}", f".{plain}"))]
         if exact is None and channel in named and not ending:
             check_there(log.name, wanted, log.signals)
-        require(
-            exact is not None or len(ending) < 2,
-            log.name,
-            expected=f"one signal for {channel}",
-            got=", ".join(ending[:LISTED]),
-            remedy=f"give --column {channel}=NAME",
-        )
+        fits = exact is not None or len(ending) < 2
+        expected = f"one signal for {channel}"
+        remedy = f"give --column {channel}=NAME"
+        require(fits, log.name, expected=expected, got=", ".join(ending[:LISTED]), remedy=remedy)
         if exact is not None or ending:
             found[channel] = exact or ending[0]
     return found

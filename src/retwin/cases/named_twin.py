@@ -150,13 +150,10 @@ def _of_file(file: Path, keys: TwinKeys, options: dict[str, Any], place: str) ->
     existing(own, file, file.is_file(), "a file")
     chosen = {"inputs": keys.inputs, "outputs": keys.outputs}
     for name, channels in chosen.items():
-        require(
-            not (isinstance(channels, Mapping) and any(channels.values())),
-            key(place, name),
-            expected=f"names alone, since units and limits are those of {file.name}",
-            got=repr(channels),
-            remedy=f"write {name} = [{', '.join(map(repr, channels))}]",
-        )
+        fits = not (isinstance(channels, Mapping) and any(channels.values()))
+        expected = f"names alone, since units and limits are those of {file.name}"
+        remedy = f"write {name} = [{', '.join(map(repr, channels))}]"
+        require(fits, key(place, name), expected=expected, got=repr(channels), remedy=remedy)
     making = _making(options, own, "outside", *(["servos"] if kind is MuJoCoTwin else []))
     settings = checked(kind, options, place=own, besides=(*ELSEWHERE, "outside"))
     if making.servos:

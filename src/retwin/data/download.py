@@ -71,13 +71,9 @@ def fetch(
 
     """
     known = _find_file(name, url, sha256)
-    require(
-        known.url.startswith(("http://", "https://")),
-        "url",
-        expected="an address that begins with https:// or http://",
-        got=known.url,
-        remedy="give the address of the file",
-    )
+    fits = known.url.startswith(("http://", "https://"))
+    expected = "an address that begins with https:// or http://"
+    require(fits, "url", expected=expected, got=known.url, remedy="give the address of the file")
     place = Path(folder) if folder else cache_folder()
     target = place / known.file
     if os.path.isfile(target) and sha256_of(target) == known.sha256:

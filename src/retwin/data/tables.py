@@ -92,13 +92,11 @@ class Table:
         """
         name = clock.column or ("" if clock.rate else time_column(self.units))
         names = list(self.units)
-        require(
-            name in names or (not name and (clock.rate or clock.otherwise)),
-            self.place,
-            expected=f"a column of times{f' {clock.column!r}' * bool(clock.column)}",
-            got=f"the columns {', '.join(names[:12])}{', …' * (len(names) > 12)}",
-            remedy="name it in the mapping: [time] column = …, or give the rows per s: rate = …",
-        )
+        fits = name in names or (not name and (clock.rate or clock.otherwise))
+        expected = f"a column of times{f' {clock.column!r}' * bool(clock.column)}"
+        got = f"the columns {', '.join(names[:12])}{', …' * (len(names) > 12)}"
+        remedy = "name it in the mapping: [time] column = …, or give the rows per s: rate = …"
+        require(fits, self.place, expected=expected, got=got, remedy=remedy)
         return name
 
     def stamps(self, name: str) -> tuple[NDArray, str, str]:

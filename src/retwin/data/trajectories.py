@@ -259,13 +259,10 @@ class Trajectories:
         """
         end = self.steps / self.rate
         times = (start, end if stop is None else stop)
-        require(
-            0 <= times[0] < times[1] <= end,
-            "start, stop",
-            expected=f"times in s, in order, from 0 to {end:g}",
-            got=f"{start} to {stop}",
-            remedy="count the seconds from the first sample",
-        )
+        fits = 0 <= times[0] < times[1] <= end
+        expected = f"times in s, in order, from 0 to {end:g}"
+        remedy = "count the seconds from the first sample"
+        require(fits, "start, stop", expected=expected, got=f"{start} to {stop}", remedy=remedy)
         span = slice(*(to_samples(each, self.rate) for each in times))
         arrays = {name: getattr(self, name)[:, span] for name in PER_SAMPLE}
         return self.replace(**arrays)

@@ -88,13 +88,9 @@ def run_study(
     """
     cores = os.cpu_count() or 1
     workers = whole("processes", cores if processes is None else processes, at_least=1)
-    require(
-        processes is None or scheduler is None,
-        "processes",
-        expected="none with a scheduler, which has its own",
-        got=processes,
-        remedy="leave one of the two out",
-    )
+    fits = processes is None or scheduler is None
+    expected = "none with a scheduler, which has its own"
+    require(fits, "processes", expected=expected, got=processes, remedy="leave one of the two out")
     out = Path(out)
     report = report or (lambda _stage, _share: None)
     with in_use(out):
@@ -272,13 +268,10 @@ def _check_healthy(plan: StudyPlan, real: Trajectories, roles: Roles) -> None:
     if not needed or plan.calibrate_on == "all":
         return
     for calibration, _ in roles.folds:
-        require(
-            (real.labels[list(calibration)] == HEALTHY).any(),
-            "calibration",
-            expected=f"at least one trajectory labelled {HEALTHY!r} in every calibration part",
-            got="none",
-            remedy="label healthy trajectories, give more of them, or calibrate on 'all'",
-        )
+        fits = (real.labels[list(calibration)] == HEALTHY).any()
+        expected = f"at least one trajectory labelled {HEALTHY!r} in every calibration part"
+        remedy = "label healthy trajectories, give more of them, or calibrate on 'all'"
+        require(fits, "calibration", expected=expected, got="none", remedy=remedy)
 
 
 def _check_classes(case: Case, plan: StudyPlan, twin: Trajectories) -> None:

@@ -67,13 +67,10 @@ class StudyData:
             remedy="give --real LOG, or --calibration LOG --test LOG; or leave the mapping out",
         )
         stated -= {"mapping"}
-        require(
-            stated in ({"calibration", "test"}, {"real"}, {"records"}, set()),
-            "real data",
-            expected="either calibration and test, or real alone, or records alone",
-            got=", ".join(sorted(stated)),
-            remedy="give --calibration FILE --test FILE, or --real FILE --folds K, or --data FILE",
-        )
+        fits = stated in ({"calibration", "test"}, {"real"}, {"records"}, set())
+        expected = "either calibration and test, or real alone, or records alone"
+        remedy = "give --calibration FILE --test FILE, or --real FILE --folds K, or --data FILE"
+        require(fits, "real data", expected=expected, got=", ".join(sorted(stated)), remedy=remedy)
 
 
 def twin_data(case: Case, plan: StudyPlan, data: StudyData, report: Report) -> Trajectories:

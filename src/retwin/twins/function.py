@@ -87,28 +87,20 @@ class FunctionTwin(ChunkedTwin):
 
     def __post_init__(self) -> None:
         for role, given in (("function", self.function), ("nominal", self.nominal)):
-            require(
-                callable(given) or (role == "nominal" and given is None),
-                role,
-                expected="something that can be called with commands",
-                got=repr(given),
-                remedy="give a function of the commands that returns the outputs",
-            )
-        require(
-            self.nominal is not None or not _takes(self.function, "rng"),
-            "nominal",
-            expected=f"a function for the ideal output, since {_name(self.function)} is random",
-            got="None",
-            remedy="give nominal=, the same without noise",
-        )
+            fits = callable(given) or (role == "nominal" and given is None)
+            expected = "something that can be called with commands"
+            remedy = "give a function of the commands that returns the outputs"
+            require(fits, role, expected=expected, got=repr(given), remedy=remedy)
+        fits = self.nominal is not None or not _takes(self.function, "rng")
+        expected = f"a function for the ideal output, since {_name(self.function)} is random"
+        remedy = "give nominal=, the same without noise"
+        require(fits, "nominal", expected=expected, got="None", remedy=remedy)
         sample_rate("rate", self.rate)
-        require(
-            self.workers >= 1 and (self.workers == 1 or not self.vectorised),
-            "workers",
-            expected="1, or more for a function of one trajectory",
-            got=f"{self.workers} with vectorised={self.vectorised}",
-            remedy="leave workers out, or give vectorised=False",
-        )
+        fits = self.workers >= 1 and (self.workers == 1 or not self.vectorised)
+        expected = "1, or more for a function of one trajectory"
+        got = f"{self.workers} with vectorised={self.vectorised}"
+        remedy = "leave workers out, or give vectorised=False"
+        require(fits, "workers", expected=expected, got=got, remedy=remedy)
         if self.workers > 1:
             check_sendable(self.function, "function", **IMPORTABLE)
             check_sendable(self.nominal, "nominal", **IMPORTABLE)

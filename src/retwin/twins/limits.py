@@ -46,13 +46,10 @@ class Limits:
 
     def __post_init__(self) -> None:
         paired = len(self.low) == len(self.high)
-        require(
-            paired and all(a <= b for a, b in zip(self.low, self.high, strict=True)),
-            "limits",
-            expected="one low and one high per input channel, low at most high",
-            got=f"low {self.low}, high {self.high}",
-            remedy=UNLIMITED,
-        )
+        fits = paired and all(a <= b for a, b in zip(self.low, self.high, strict=True))
+        expected = "one low and one high per input channel, low at most high"
+        got = f"low {self.low}, high {self.high}"
+        require(fits, "limits", expected=expected, got=got, remedy=UNLIMITED)
         one_of("outside", self.outside, ("refuse", "clip"))
 
     def keep(self, commands: NDArray, inputs: Channels) -> NDArray:

@@ -114,13 +114,11 @@ def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
     """
     array = np.ascontiguousarray(commands)  # torch takes no negative strides
     shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] >= 2
-    require(
-        shaped and array.shape[2] == len(inputs) and array.dtype.kind in "fiu",
-        "commands",
-        expected=f"numbers of shape (n, T, {len(inputs)}), T at least 2",
-        got=f"{array.dtype} of shape {array.shape}",
-        remedy=f"give one column per input channel, {', '.join(inputs.names)}",
-    )
+    fits = shaped and array.shape[2] == len(inputs) and array.dtype.kind in "fiu"
+    expected = f"numbers of shape (n, T, {len(inputs)}), T at least 2"
+    got = f"{array.dtype} of shape {array.shape}"
+    remedy = f"give one column per input channel, {', '.join(inputs.names)}"
+    require(fits, "commands", expected=expected, got=got, remedy=remedy)
     check_finite("commands", array)
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
@@ -166,13 +164,10 @@ def checked_stride(
 def check_healthy(argument: str, trajectories: Trajectories) -> None:
     """Refuse a set without trajectories, or with one that is labelled with a fault."""
     faulty = int((~trajectories.maybe_healthy).sum())
-    require(
-        len(trajectories) > 0 and not faulty,
-        argument,
-        expected="healthy trajectories, one at least",
-        got=f"{len(trajectories)}, {faulty} of them with a fault",
-        remedy=f"take {argument}.with_label({HEALTHY!r})",
-    )
+    fits = len(trajectories) > 0 and not faulty
+    got = f"{len(trajectories)}, {faulty} of them with a fault"
+    remedy = f"take {argument}.with_label({HEALTHY!r})"
+    require(fits, argument, expected="healthy trajectories, one at least", got=got, remedy=remedy)
 
 
 def check_channels(twin: Twin, trajectories: Trajectories, argument: str) -> None:

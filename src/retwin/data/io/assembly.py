@@ -148,13 +148,10 @@ def assemble(
     """
     first = raws[0]
     for raw in raws:
-        require(
-            (raw.commands is None) == (first.commands is None),
-            raw.where,
-            expected="commands in every trajectory or in none",
-            got="commands in some trajectories only",
-            remedy="split the data into two sets",
-        )
+        fits = (raw.commands is None) == (first.commands is None)
+        expected = "commands in every trajectory or in none"
+        got = "commands in some trajectories only"
+        require(fits, raw.where, expected=expected, got=got, remedy="split the data into two sets")
         for name, block in raw.blocks.items():
             _check_block(name, block, raw, first)
     steps = max(len(raw.nominal) for raw in raws)

@@ -136,13 +136,10 @@ def _read_dataset(
             got=", ".join(sorted(mat_variables(file, budget, reader))) or "none",
             remedy="give the folder of the authors' data as it is",
         )
-    require(
-        len(nominal) == len(observed),
-        f"{where}: trajResps",
-        expected=f"{len(nominal)} samples, as trajCmds",
-        got=len(observed),
-        remedy="sample both on the same grid",
-    )
+    fits = len(nominal) == len(observed)
+    expected = f"{len(nominal)} samples, as trajCmds"
+    remedy = "sample both on the same grid"
+    require(fits, f"{where}: trajResps", expected=expected, got=len(observed), remedy=remedy)
     label = file.parent.name
     return Raw(where, label, nominal, observed, commands, f"{label}/{file.stem}", recorded)
 
@@ -150,13 +147,10 @@ def _read_dataset(
 def _upright(value: Any, width: int, where: str) -> NDArray:
     """`value` as (T, width), transposed if only its first axis has that width."""
     block = matrix(value, where)
-    require(
-        (block.shape[0] == width) != (block.shape[1] == width),
-        where,
-        expected=f"samples by {width} columns, or {width} rows by samples",
-        got=f"shape {block.shape}",
-        remedy="save samples by columns, with another number of samples than columns",
-    )
+    fits = (block.shape[0] == width) != (block.shape[1] == width)
+    expected = f"samples by {width} columns, or {width} rows by samples"
+    remedy = "save samples by columns, with another number of samples than columns"
+    require(fits, where, expected=expected, got=f"shape {block.shape}", remedy=remedy)
     return block if block.shape[1] == width else block.T
 
 

@@ -162,13 +162,11 @@ def matrix(value: Any, where: str) -> NDArray:
 
     """
     block = np.asarray(value)
-    require(
-        block.dtype.kind in "iuf" and block.ndim == 2 and block.size,
-        where,
-        expected="a table of real numbers, samples by columns",
-        got=f"{block.dtype} of shape {block.shape}",
-        remedy="save the numbers as a two-dimensional array",
-    )
+    fits = block.dtype.kind in "iuf" and block.ndim == 2 and block.size
+    expected = "a table of real numbers, samples by columns"
+    got = f"{block.dtype} of shape {block.shape}"
+    remedy = "save the numbers as a two-dimensional array"
+    require(fits, where, expected=expected, got=got, remedy=remedy)
     if block.dtype.kind != "f":
         return block.astype(np.float64)
     return block.astype(block.dtype.newbyteorder("="), copy=False)
@@ -176,24 +174,17 @@ def matrix(value: Any, where: str) -> NDArray:
 
 def _cells(value: Any, where: str) -> list[Any]:
     cells = np.asarray(value)
-    require(
-        cells.dtype == object and cells.size in (0, max(cells.shape, default=0)),
-        where,
-        expected="a row of cells, one per trajectory",
-        got=f"{cells.dtype} of shape {cells.shape}",
-        remedy="save a cell array of size 1 by n",
-    )
+    fits = cells.dtype == object and cells.size in (0, max(cells.shape, default=0))
+    expected = "a row of cells, one per trajectory"
+    got = f"{cells.dtype} of shape {cells.shape}"
+    require(fits, where, expected=expected, got=got, remedy="save a cell array of size 1 by n")
     return list(cells.ravel())
 
 
 def _text(value: Any, where: str) -> str:
     name = np.asarray(value)
     # An empty text has no element: a trajectory without a label.
-    require(
-        name.dtype.kind == "U" and name.size <= 1,
-        where,
-        expected="a class name",
-        got=f"{name.dtype} of shape {name.shape}",
-        remedy="save class names as texts",
-    )
+    fits = name.dtype.kind == "U" and name.size <= 1
+    got = f"{name.dtype} of shape {name.shape}"
+    require(fits, where, expected="a class name", got=got, remedy="save class names as texts")
     return str(name.item()) if name.size else ""

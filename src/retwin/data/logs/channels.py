@@ -192,13 +192,10 @@ def mean_of(found: Sequence[Signal], place: str) -> Signal:
     """The mean of signals with the same times and unit, which is missing where one is."""
     first = found[0]
     for other in found[1:]:
-        require(
-            np.array_equal(first.times, other.times) and same_unit(first.unit, other.unit),
-            f"{place}, {other.name}",
-            expected=f"the times and the unit of {first.name!r}, with which it is averaged",
-            got="others",
-            remedy="map one of them alone",
-        )
+        fits = np.array_equal(first.times, other.times) and same_unit(first.unit, other.unit)
+        expected = f"the times and the unit of {first.name!r}, with which it is averaged"
+        remedy = "map one of them alone"
+        require(fits, f"{place}, {other.name}", expected=expected, got="others", remedy=remedy)
     return replace(
         first,
         name=", ".join(each.name for each in found),

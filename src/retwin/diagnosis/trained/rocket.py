@@ -68,13 +68,9 @@ class Rocket:
     kernels: int = 9996
 
     def __post_init__(self) -> None:
-        require(
-            whole("kernels", self.kernels, at_least=PATTERNS) % PATTERNS == 0,
-            "kernels",
-            expected=f"a multiple of {PATTERNS}",
-            got=self.kernels,
-            remedy="round it",
-        )
+        fits = whole("kernels", self.kernels, at_least=PATTERNS) % PATTERNS == 0
+        expected = f"a multiple of {PATTERNS}"
+        require(fits, "kernels", expected=expected, got=self.kernels, remedy="round it")
 
     def fit(self, task: TrainingTask) -> RocketDiagnoser:
         """Fit MiniRocket and a ridge; see `fit_diagnoser`.
@@ -163,13 +159,11 @@ class RocketDiagnoser:
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes), see `Diagnoser`."""
         standard = (self.features(trajectories) - self.weights["mean"]) / self.weights["scale"]
-        require(
-            standard.shape[1] == self.samples,
-            "trajectories.steps",
-            expected=f"as many as it was trained on, {self.samples} samples of the features",
-            got=f"{standard.shape[1]} samples",
-            remedy="cut or pad them to that length",
-        )
+        fits = standard.shape[1] == self.samples
+        expected = f"as many as it was trained on, {self.samples} samples of the features"
+        got = f"{standard.shape[1]} samples"
+        remedy = "cut or pad them to that length"
+        require(fits, "trajectories.steps", expected=expected, got=got, remedy=remedy)
         convolved = _convolve(self._transform, standard)
         slope, level = (self.weights[name].double().numpy() for name in ("slope", "level"))
         found: NDArray = softmax(convolved @ slope.T + level, axis=1)

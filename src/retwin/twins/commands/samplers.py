@@ -362,13 +362,10 @@ def _check_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[NDAr
     """Both as arrays (d_u,), finite and in order."""
     lower, upper = np.array(low, float), np.array(high, float)
     paired = lower.ndim == 1 and lower.shape == upper.shape and len(lower) > 0
-    require(
-        paired and np.isfinite([lower, upper]).all() and (lower < upper).all(),
-        "limits",
-        expected="a finite low and a greater finite high per input channel",
-        got=f"low {low}, high {high}",
-        remedy="give the range from which levels are drawn",
-    )
+    fits = paired and np.isfinite([lower, upper]).all() and (lower < upper).all()
+    expected = "a finite low and a greater finite high per input channel"
+    remedy = "give the range from which levels are drawn"
+    require(fits, "limits", expected=expected, got=f"low {low}, high {high}", remedy=remedy)
     return lower, upper
 
 

@@ -165,12 +165,9 @@ def frozen_from(
         if response is rising:
             continue
         onset = response[-1].astype(int)
-        require(
-            np.array_equal(response, np.minimum(rising, onset)),
-            "faults",
-            expected="faults that hold an actuator's response or leave it as it is",
-            got=fault,
-            remedy="use a twin that computes its actuators' response, or faults of the command",
-        )
+        fits = np.array_equal(response, np.minimum(rising, onset))
+        expected = "faults that hold an actuator's response or leave it as it is"
+        remedy = "use a twin that computes its actuators' response, or faults of the command"
+        require(fits, "faults", expected=expected, got=fault, remedy=remedy)
         onsets[i] = np.where(onset < steps - 1, onset, steps)
     return onsets

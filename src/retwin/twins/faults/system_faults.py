@@ -59,13 +59,10 @@ class TimedFault(Fault):
         if self.end is None:
             return
         first, last = ends_of(self.end)
-        require(
-            low < first <= last < math.inf and high < last,
-            "end",
-            expected=f"a time in s after the onset at {self.onset}, or a pair (low, high) of them",
-            got=repr(self.end),
-            remedy="leave it out for a fault that lasts",
-        )
+        fits = low < first <= last < math.inf and high < last
+        expected = f"a time in s after the onset at {self.onset}, or a pair (low, high) of them"
+        remedy = "leave it out for a fault that lasts"
+        require(fits, "end", expected=expected, got=repr(self.end), remedy=remedy)
 
     def onset_range(self, steps: int, rate: float) -> tuple[int, int]:
         """First and last sample at which it can begin in a trajectory of so many samples.
@@ -123,13 +120,10 @@ class SizedFault(TimedFault):
     def __post_init__(self) -> None:
         super().__post_init__()
         low, high = ends_of(self.size)
-        require(
-            -math.inf < low <= high < math.inf and not low == high == 0,
-            "size",
-            expected="a number other than 0, or a pair (low, high) in order",
-            got=repr(self.size),
-            remedy="give the sizes of real faults, with their sign",
-        )
+        fits = -math.inf < low <= high < math.inf and not low == high == 0
+        expected = "a number other than 0, or a pair (low, high) in order"
+        remedy = "give the sizes of real faults, with their sign"
+        require(fits, "size", expected=expected, got=repr(self.size), remedy=remedy)
 
     def drawn(self, rng: np.random.Generator, *, steps: int, segments: int, rate: float) -> Self:
         """The same fault with all that is open drawn; see `Fault.drawn`."""
@@ -348,13 +342,10 @@ def check_faults(
     """
     for fault in {id(fault): fault for fault in faults}.values():  # thousands are the same object
         for name, count in (("actuator", inputs), ("output", outputs)):
-            require(
-                0 <= getattr(fault, name, 0) < count or not hasattr(fault, name),
-                "faults",
-                expected=f"an {name} from 0 to {count - 1}",
-                got=fault,
-                remedy=f"count the {'command' if name == 'actuator' else name} channels from 0",
-            )
+            fits = 0 <= getattr(fault, name, 0) < count or not hasattr(fault, name)
+            expected = f"an {name} from 0 to {count - 1}"
+            remedy = f"count the {'command' if name == 'actuator' else name} channels from 0"
+            require(fits, "faults", expected=expected, got=fault, remedy=remedy)
         if isinstance(fault, ParameterFault):
             require(
                 fault.parameter in shiftable,

@@ -233,13 +233,10 @@ def _scalars(variable: Any, argument: str, *, max_scalars: int = 1_000_000) -> I
     if not variable.shape:
         yield Scalar(variable.name, variable)
         return
-    require(
-        prod(variable.shape) <= max_scalars,
-        argument,
-        expected=f"arrays of at most {max_scalars} numbers",
-        got=f"{variable.name!r} of shape {variable.shape}",
-        remedy="export the FMU with smaller arrays",
-    )
+    fits = prod(variable.shape) <= max_scalars
+    expected = f"arrays of at most {max_scalars} numbers"
+    got = f"{variable.name!r} of shape {variable.shape}"
+    require(fits, argument, expected=expected, got=got, remedy="export the FMU with smaller arrays")
     for place, index in enumerate(np.ndindex(variable.shape)):
         yield Scalar(f"{variable.name}[{','.join(map(str, index))}]", variable, place)
 

@@ -115,13 +115,11 @@ class FMUTwin:
         sample_rate("rate", self.rate)
         positive("timeout", self.timeout, unit="s")
         for name, rate in self.rates.items():
-            require(
-                name in self.inputs.names and 0 < rate <= self.rate,
-                "rates",
-                expected=f"inputs of the twin, each with a rate above 0 and up to {self.rate:g} Hz",
-                got=f"{name!r} with {rate:g} Hz",
-                remedy=f"the inputs are {', '.join(self.inputs.names)}",
-            )
+            fits = name in self.inputs.names and 0 < rate <= self.rate
+            expected = f"inputs of the twin, each with a rate above 0 and up to {self.rate:g} Hz"
+            got = f"{name!r} with {rate:g} Hz"
+            remedy = f"the inputs are {', '.join(self.inputs.names)}"
+            require(fits, "rates", expected=expected, got=got, remedy=remedy)
         _ = self.substeps
 
     @classmethod

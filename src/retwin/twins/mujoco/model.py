@@ -159,13 +159,10 @@ def _add_sensors(spec: mujoco.MjSpec, places: Sequence[str]) -> None:
         what, sensor = PLACES[found]
         if what == "joints":
             joint = named[what][name]
-            require(
-                joint.type != mujoco.mjtJoint.mjJNT_FREE,
-                "outputs",
-                expected="a joint that is no free joint",
-                got=repr(place),
-                remedy=f"name the body that it moves, body:{joint.parent.name}",
-            )
+            fits = joint.type != mujoco.mjtJoint.mjJNT_FREE
+            expected = "a joint that is no free joint"
+            remedy = f"name the body that it moves, body:{joint.parent.name}"
+            require(fits, "outputs", expected=expected, got=repr(place), remedy=remedy)
             sensor = OF_BALLS[sensor] if joint.type == mujoco.mjtJoint.mjJNT_BALL else sensor
         spec.add_sensor(name=place, type=sensor, objtype=OBJECTS[what], objname=name)
 

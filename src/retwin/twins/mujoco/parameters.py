@@ -126,13 +126,11 @@ def set_parameter(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None
 
     """
     with _parts(name) as (parts, index):
-        require(
-            parts["option"] not in SHARED_OPTIONS,
-            "parameters",
-            expected="numbers that may differ between simulations",
-            got=f"{name!r}, which they share",
-            remedy="set it in the model, or give the twin another step",
-        )
+        fits = parts["option"] not in SHARED_OPTIONS
+        expected = "numbers that may differ between simulations"
+        got = f"{name!r}, which they share"
+        remedy = "set it in the model, or give the twin another step"
+        require(fits, "parameters", expected=expected, got=got, remedy=remedy)
         if parts["option"]:
             field = batch.expand(f"opt.{parts['option']}")
             field.reshape(len(values), -1)[:, index] = values
