@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from retwin.update.forecast_errors import value_range
 
 Notes = dict[str, list[str]]
 """What was done while logs were read, and the names of the files to which that applies."""
+Places = list[int | None]
+"""The column of each channel among those of a log; None for one that the log does not have."""
 CONSTANT = "constant in what was read, which therefore shows no dynamics of it."
 """What is noted of channels that never change."""
 
@@ -108,11 +110,11 @@ def match_twin(
 
 def _places(
     own: Channels, wanted: Channels, names: Mapping[str, str], name: str, prefix: str
-) -> list[int | None]:
+) -> Places:
     """Where each channel of the twin is among those of a log; None where it is not."""
     if own == Channels.numbered(prefix, len(wanted)):
         return list(range(len(wanted)))  # a log whose channels nobody has named
-    places: list[int | None] = []
+    places: Places = []
     for channel in wanted.names:
         column = names.get(channel, channel)
         if channel in names:
@@ -122,12 +124,7 @@ def _places(
 
 
 def _columns(
-    values: NDArray,
-    own: Channels,
-    places: Sequence[int | None],
-    wanted: Channels,
-    name: str,
-    notes: Notes,
+    values: NDArray, own: Channels, places: Places, wanted: Channels, name: str, notes: Notes
 ) -> NDArray:
     """Values (n, T, d) of the channels of the twin in its units; 0 of those that are not there."""
     made = np.zeros((*values.shape[:2], len(places)))
@@ -142,7 +139,7 @@ def _columns(
     return made
 
 
-def _units_taken(own: Channels, wanted: Channels, places: Sequence[int | None]) -> list[str]:
+def _units_taken(own: Channels, wanted: Channels, places: Places) -> list[str]:
     """Channels of a twin without a unit, with the unit that the log has."""
     channels = zip(wanted.names, wanted.units, places, strict=True)
     return [

@@ -18,6 +18,8 @@ from retwin.errors import InputError
 from retwin.times import sample_rate
 from retwin.workers.threads import in_threads
 
+Speed = Callable[[NDArray, NDArray], NDArray]
+"""From trajectories and steps, each (k,), to the speed (k,) of the commands in these steps."""
 TRAJECTORIES_PER_BLOCK = 32
 """Trajectories per pass over the commands, few enough that their samples fit the cache."""
 
@@ -197,9 +199,7 @@ class Segments:
         return cls._from_moving(moving, lambda row, step: speed[row, step])
 
     @classmethod
-    def _from_moving(
-        cls, moving: NDArray, speed: Callable[[NDArray, NDArray], NDArray]
-    ) -> Segments:
+    def _from_moving(cls, moving: NDArray, speed: Speed) -> Segments:
         """Segments whose motion part is where `moving` (n, T - 1) is True.
 
         `speed` gives the speeds of trajectories in steps, for arrays of their indices.
@@ -210,14 +210,7 @@ class Segments:
         return cls.from_edges(len(moving), moving.shape[1] + 1, row, edge, speed)
 
     @classmethod
-    def from_edges(
-        cls,
-        n: int,
-        steps: int,
-        row: NDArray,
-        edge: NDArray,
-        speed: Callable[[NDArray, NDArray], NDArray],
-    ) -> Segments:
+    def from_edges(cls, n: int, steps: int, row: NDArray, edge: NDArray, speed: Speed) -> Segments:
         """Segments of n trajectories from the samples at which they begin and cease to move.
 
         Parameters
@@ -245,13 +238,7 @@ class Segments:
         return cls(start, np.minimum(settle, stop), stop, valid, steps)
 
 
-def _rest(
-    speed: Callable[[NDArray, NDArray], NDArray],
-    row: NDArray,
-    steps: int,
-    edge: NDArray,
-    inner: NDArray,
-) -> NDArray:
+def _rest(speed: Speed, row: NDArray, steps: int, edge: NDArray, inner: NDArray) -> NDArray:
     """The fraction (0 … 1) of the step `edge` at rest, given that `inner` moves all the time."""
     inside = (inner >= 0) & (inner < steps)
     full = speed(row, np.clip(inner, 0, steps - 1))

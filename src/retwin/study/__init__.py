@@ -101,7 +101,20 @@ def run_study(
         work_folder = out / "work"
         stages = Stages(report, expected_seconds(plan, workers), workers)
         if not (work_folder / "roles.json").exists():
-            _prepare(case, plan, data, out, found, stages.prepare)
+            real, roles = real_data(case, plan, data, stages.prepare)
+            roles = roles.first_of_each(real.labels, plan.calibrated)
+            _check_healthy(plan, real, roles)
+            twin = twin_data(case, plan, data, stages.prepare)
+            remedy = "give more of them, or a larger per_class"
+            at_least("twin-data", twin, MIN_TRAJECTORIES, "trajectories of the twin", remedy=remedy)
+            _check_classes(case, plan, twin)
+            # Nothing is written before everything is checked. A set that may not fit into memory
+            # stays in Zarr, which is read in chunks. The roles mark the folder as complete.
+            write_json(out / "study.json", {"retwin": __version__, **found})
+            save(real, work_folder / "real.npz")
+            large = data.twin is not None and (data.twin / "zarr.json").exists()
+            save(twin, work_folder / ("twin.zarr" if large else "twin.npz"))
+            write_json(work_folder / "roles.json", roles.folds)
         roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))
         _check_healthy(plan, Files(work_folder).real_data(), roles)
         work = Work(work_folder.resolve(), case, plan, roles)
@@ -213,34 +226,6 @@ def possible_sources(case: Case, plan: StudyPlan) -> tuple[str, ...]:
 
     """
     return tuple(name for name in SOURCES if not lacking(name, case, plan))
-
-
-def _prepare(
-    case: Case,
-    plan: StudyPlan,
-    data: StudyData,
-    out: Path,
-    found: Mapping[str, Any],
-    report: Report,
-) -> None:
-    """Read and check all data, then write them with commands for the jobs, and the roles.
-
-    Nothing is written before everything is checked. The roles are written last, so that their
-    file marks the folder as complete.
-    """
-    real, roles = real_data(case, plan, data, report)
-    roles = roles.first_of_each(real.labels, plan.calibrated)
-    _check_healthy(plan, real, roles)
-    twin = twin_data(case, plan, data, report)
-    remedy = "give more of them, or a larger per_class"
-    at_least("twin-data", twin, MIN_TRAJECTORIES, "trajectories of the twin", remedy=remedy)
-    _check_classes(case, plan, twin)
-    write_json(out / "study.json", {"retwin": __version__, **found})
-    save(real, out / "work" / "real.npz")
-    # A set that may not fit into memory stays in Zarr, which is read in chunks.
-    large = data.twin is not None and (data.twin / "zarr.json").exists()
-    save(twin, out / "work" / ("twin.zarr" if large else "twin.npz"))
-    write_json(out / "work" / "roles.json", roles.folds)
 
 
 def _about(

@@ -90,6 +90,10 @@ class Fault(Protocol):
         return response
 
 
+Faults = Sequence[Fault | None]
+"""One per trajectory, None for a healthy one."""
+
+
 def ends_of(value: Any) -> tuple[float, float]:
     """Ends of what is a number or a pair (low, high) of them; NaN for anything else."""
     ends = value if isinstance(value, Sequence) else (value,) * 2

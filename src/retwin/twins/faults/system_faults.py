@@ -20,6 +20,7 @@ from retwin.times import to_samples
 from retwin.twins.faults.actuator_faults import (
     ActuatorBias,
     Fault,
+    Faults,
     Stuck,
     checked_onset,
     ends_of,
@@ -292,7 +293,7 @@ FAULTS: tuple[type, ...] = (
 """The kinds of faults that a file may name."""
 
 
-def measured_with(observed: NDArray, faults: Sequence[Fault | None], rate: float) -> NDArray:
+def measured_with(observed: NDArray, faults: Faults, rate: float) -> NDArray:
     """Outputs (n, T, d_y) as sensors with these faults, one per trajectory, measure them."""
     rows = [i for i, fault in enumerate(faults) if isinstance(fault, TimedFault)]
     if not rows:
@@ -303,15 +304,13 @@ def measured_with(observed: NDArray, faults: Sequence[Fault | None], rate: float
     return made
 
 
-def without_sensor_faults(faults: Sequence[Fault | None]) -> list[Fault | None]:
+def without_sensor_faults(faults: Faults) -> list[Fault | None]:
     """The faults without those of sensors, which act on what a wrapper makes of the outputs."""
     sensors = (SensorBias, SensorDrift, SensorFreeze)
     return [None if isinstance(fault, sensors) else fault for fault in faults]
 
 
-def parameter_changes(
-    faults: Sequence[Fault | None], names: Sequence[str], steps: int, rate: float
-) -> NDArray:
+def parameter_changes(faults: Faults, names: Sequence[str], steps: int, rate: float) -> NDArray:
     """What faults add to the parameters `names` at each sample, (n, T, q)."""
     made = np.zeros((len(faults), steps, len(names)))
     for i, fault in enumerate(faults):
@@ -320,9 +319,7 @@ def parameter_changes(
     return made
 
 
-def check_faults(
-    faults: Sequence[Fault | None], inputs: int, outputs: int, shiftable: Sequence[str]
-) -> None:
+def check_faults(faults: Faults, inputs: int, outputs: int, shiftable: Sequence[str]) -> None:
     """Refuse faults of actuators, outputs and parameters that a twin does not have.
 
     Parameters
