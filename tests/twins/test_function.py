@@ -14,7 +14,7 @@ import pytest
 
 import retwin as rt
 from retwin.twins.faults.applied_faults import faulty_commands, frozen_response
-from retwin.twins.function import TRAJECTORIES_PER_CHUNK, FunctionTwin
+from retwin.twins.function import FunctionTwin
 
 INPUTS = rt.Channels(("valve", "heater"), ("1", "W"))
 OUTPUTS = rt.Channels(("level",), ("m",))
@@ -129,12 +129,12 @@ def test_noise_is_in_the_residual(settings: dict) -> None:
 
 
 def test_same_bytes_whatever_the_workers() -> None:
-    commands = trajectories(TRAJECTORIES_PER_CHUNK + 3)
+    commands = trajectories(128 + 3)
     faults = [
         rt.Stuck(0, onset=(0.5, 2.0)),
         None,
         rt.ActuatorBias(1, (10.0, 50.0)),
-    ] * TRAJECTORIES_PER_CHUNK
+    ] * 128
     made = [
         twin(noisy, nominal=level, vectorised=False, workers=workers).simulate(
             commands, faults=faults[: len(commands)], seed=8

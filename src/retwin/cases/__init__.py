@@ -67,13 +67,9 @@ def get(name: str) -> Case:
             if isinstance(found, Twin):
                 remedy = f"retwin identify {name} LOG --out FOLDER writes the case of a twin: "
                 remedy += "FOLDER/updated.toml"
-    raise InputError(
-        f"case {name!r}",
-        expected=f"{', '.join(catalog.CASES)}, a file *.toml, or package.module:object naming a "
-        "Case",
-        got=got,
-        remedy=remedy,
-    )
+    expected = f"{', '.join(catalog.CASES)}, a file *.toml, or package.module:object naming a "
+    expected += "Case"
+    raise InputError(f"case {name!r}", expected=expected, got=got, remedy=remedy)
 
 
 def data_case(name: str) -> DataCase:

@@ -43,23 +43,15 @@ def merge_bases(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any
     place = key(f"{path}:", "based_on")
     above = (*above, path.resolve())
     toml = isinstance(base, str) and Path(base).suffix.lower() == ".toml"
-    require(
-        toml or base in catalog.CASES,
-        place,
-        expected=f"the name of another case.toml, or one of {', '.join(catalog.CASES)}",
-        got=repr(base),
-        remedy="check the spelling",
-    )
+    expected = f"the name of another case.toml, or one of {', '.join(catalog.CASES)}"
+    remedy = "check the spelling"
+    require(toml or base in catalog.CASES, place, expected=expected, got=repr(base), remedy=remedy)
     if not toml:
         return settings, base
     other = path.parent / base
-    require(
-        other.resolve() not in above,
-        place,
-        expected="a case that is not based on this one",
-        got=repr(base),
-        remedy="name the case that holds all settings",
-    )
+    expected = "a case that is not based on this one"
+    remedy = "name the case that holds all settings"
+    require(other.resolve() not in above, place, expected=expected, got=repr(base), remedy=remedy)
     inner, home = merge_bases(other, above)
     for name, value in settings.items():
         old = inner.get(name)
@@ -90,13 +82,10 @@ def updated_built_in(base: str, settings: Mapping[str, Any], place: str) -> Case
     inside = key(place, "parameters")
     for name in keys.parameters:
         one_of(key(inside, name), name, names)
-    require(
-        keys.parameters and made.parametric is not None,
-        inside,
-        expected=f"some of {', '.join(names) or 'none, since the case has no parameters'}",
-        got="none",
-        remedy=f'give "{base}" itself where a case is wanted',
-    )
+    fits = keys.parameters and made.parametric is not None
+    expected = f"some of {', '.join(names) or 'none, since the case has no parameters'}"
+    remedy = f'give "{base}" itself where a case is wanted'
+    require(fits, inside, expected=expected, got="none", remedy=remedy)
     assert made.parametric is not None
     with at(place):
         twin = made.parametric.freed(parameters_of(keys.parameters, inside))

@@ -58,20 +58,14 @@ class Record:
 
     def __post_init__(self) -> None:
         finite("transient", self.transient, at_least=0.0, unit="s", remedy="leave it out")
-        require(
-            self.rows is None or 0 <= self.rows[0] < self.rows[1],
-            "rows",
-            expected="the first row, at least 0, and a later one at which the record ends",
-            got=self.rows,
-            remedy="count from 0 after the header",
-        )
-        require(
-            all(map(_several, self.columns.values())),
-            "columns",
-            expected="the column of each channel, or several",
-            got=dict(self.columns),
-            remedy='write for each channel NAME = "COLUMN", or a list for their mean',
-        )
+        fits = self.rows is None or 0 <= self.rows[0] < self.rows[1]
+        expected = "the first row, at least 0, and a later one at which the record ends"
+        remedy = "count from 0 after the header"
+        require(fits, "rows", expected=expected, got=self.rows, remedy=remedy)
+        fits = all(map(_several, self.columns.values()))
+        expected = "the column of each channel, or several"
+        remedy = 'write for each channel NAME = "COLUMN", or a list for their mean'
+        require(fits, "columns", expected=expected, got=dict(self.columns), remedy=remedy)
 
     @property
     def clock(self) -> TimeColumn | None:
@@ -116,13 +110,9 @@ class Record:
             there = (path / pattern).is_file()
             names = [pattern] if there else sorted(glob(pattern, root_dir=path))
             files = [path / name for name in names]
-            require(
-                files and all(file.is_file() for file in files),
-                str(path),
-                expected=f"files {pattern}",
-                got="none",
-                remedy="check the names of the record's files, and the folder",
-            )
+            fits = files and all(file.is_file() for file in files)
+            remedy = "check the names of the record's files, and the folder"
+            require(fits, str(path), expected=f"files {pattern}", got="none", remedy=remedy)
             found += files
         return [(file, replace(self, files=str(file))) for file in dict.fromkeys(found)]
 
@@ -295,22 +285,17 @@ def record_in(
     steps = int(np.flatnonzero(ends).max(initial=-1)) + 1
     first = int(np.append(known, False).argmin())
     missing = f", none at {first / rate:g} s" if clock and first < steps else ""
-    require(
-        steps >= 2 and known[:steps].all(),
-        source.name,
-        expected="a number for every command until the record ends, two rows at least",
-        got=f"{int(known.sum())} of {steps} rows of the {name} record{missing}",
-        remedy="fill in the missing commands, which are known inputs, or give the rows before "
-        "and after them as two records",
-    )
+    fits = steps >= 2 and known[:steps].all()
+    expected = "a number for every command until the record ends, two rows at least"
+    got = f"{int(known.sum())} of {steps} rows of the {name} record{missing}"
+    remedy = "fill in the missing commands, which are known inputs, or give the rows before "
+    remedy += "and after them as two records"
+    require(fits, source.name, expected=expected, got=got, remedy=remedy)
     observed[:, : round(record.transient * rate)] = np.nan
-    require(
-        np.isfinite(observed[:, :steps]).any(),
-        source.name,
-        expected=f"measurements in the {name} record, after its transient",
-        got=f"none in {steps} rows",
-        remedy="check columns, rows and transient",
-    )
+    fits = np.isfinite(observed[:, :steps]).any()
+    expected = f"measurements in the {name} record, after its transient"
+    remedy = "check columns, rows and transient"
+    require(fits, source.name, expected=expected, got=f"none in {steps} rows", remedy=remedy)
     commands = commands[:, :steps]
     return Trajectories(
         commands=commands,
@@ -339,10 +324,8 @@ def _table(path: Path, records: Sequence[Record]) -> Table:
         columns[name], bad = table.numbers(name)
         if bad.any():
             row = int(np.argmax(bad))
-            raise InputError(
-                table.place,
-                expected=f"numbers in columns {', '.join(names)}",
-                got=f"{str(table.cells(name)[row])[:40]!r} in data row {row} of {name}",
-                remedy="correct that cell, or leave it empty where nothing was measured",
-            )
+            expected = f"numbers in columns {', '.join(names)}"
+            got = f"{str(table.cells(name)[row])[:40]!r} in data row {row} of {name}"
+            remedy = "correct that cell, or leave it empty where nothing was measured"
+            raise InputError(table.place, expected=expected, got=got, remedy=remedy)
     return replace(table, cells=columns.__getitem__)

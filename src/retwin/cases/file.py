@@ -233,13 +233,9 @@ def _own(name: str, folder: Path, place: str, protocol: type) -> Any:
     """An object of the user's own; of a class, one made without arguments."""
     found = imported(name, folder, place)
     found = found() if isinstance(found, type) else found
-    require(
-        fits(found, protocol),
-        place,
-        expected=f"a {protocol.__name__}",
-        got=f"{name!r}, a {type(found).__name__}",
-        remedy=f"see {protocol.__module__}.{protocol.__name__} for what it must have",
-    )
+    got = f"{name!r}, a {type(found).__name__}"
+    remedy = f"see {protocol.__module__}.{protocol.__name__} for what it must have"
+    require(fits(found, protocol), place, expected=f"a {protocol.__name__}", got=got, remedy=remedy)
     return found
 
 
@@ -271,13 +267,8 @@ def _sampler(
     """The distribution of commands: like those of a `file`, of a kind, or of the user's own."""
     if isinstance(value, str):
         return _own(value, folder, place, CommandSampler)
-    require(
-        value,
-        place,
-        expected="how commands are drawn",
-        got="nothing",
-        remedy='write file = "RECORD" for commands like recorded ones, or `kind` and its settings',
-    )
+    remedy = 'write file = "RECORD" for commands like recorded ones, or `kind` and its settings'
+    require(value, place, expected="how commands are drawn", got="nothing", remedy=remedy)
     limits: Limits | None = getattr(twin, "limits", None)
     if set(value) == {"file"}:
         return sampler_from(
@@ -343,13 +334,10 @@ def _checked_split(
     """The records that a user's function gives, checked."""
     made = function(Path(path))
     fine = isinstance(made, tuple) and len(made) == 2
-    require(
-        fine and all(isinstance(each, Trajectories) for each in made),
-        place,
-        expected="a function that returns two Trajectories, for calibration and for tests",
-        got=f"one that returned {made!r:.80}",
-        remedy="return (calibration, test)",
-    )
+    fine = fine and all(isinstance(each, Trajectories) for each in made)
+    expected = "a function that returns two Trajectories, for calibration and for tests"
+    got = f"one that returned {made!r:.80}"
+    require(fine, place, expected=expected, got=got, remedy="return (calibration, test)")
     for each in made:
         remedy = "give them the channels and the rate of the twin"
         agree(place, each, twin, "that of the twin", remedy=remedy)

@@ -10,7 +10,7 @@ import numpy as np
 
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
-from retwin.cases.matching import match_twin, usable
+from retwin.cases.matching import Notes, match_twin, usable
 from retwin.cases.named_signals import (
     Columns,
     has_times,
@@ -142,13 +142,9 @@ class LogReader:
         steps = [np.diff(log.signals[each].times) for each in found.values()]
         medians = [float(np.median(each)) for each in steps if len(each)]
         step = float(np.median(medians)) if medians else 0.0
-        require(
-            step > 0,
-            path.name,
-            expected="times that increase",
-            got=f"a median interval of {step:g} s",
-            remedy="name the column of the times, or give the sample rate and no times",
-        )
+        got = f"a median interval of {step:g} s"
+        remedy = "name the column of the times, or give the sample rate and no times"
+        require(step > 0, path.name, expected="times that increase", got=got, remedy=remedy)
         plain = float(f"{1 / step:.3g}")
         return plain if abs(plain * step - 1) < ROUNDED else 1 / step
 
@@ -188,7 +184,7 @@ class LogReader:
         """See `read_logs`."""
         at_least("logs", paths, 1, "log", remedy="name the files with the measurements")
         self._check_columns(twin)
-        notes: dict[str, list[str]] = {}
+        notes: Notes = {}
         sets, tests = [], []
         for path in tracked(map(Path, paths), len(paths), progress):
             own, test = self._of_log(path, twin, case, notes, rows_at_rate=rows_at_rate)
@@ -206,13 +202,7 @@ class LogReader:
         nothing("columns", unknown, f"channels of the twin, {', '.join(names)}", remedy=remedy)
 
     def _of_log(
-        self,
-        path: Path,
-        twin: Twin,
-        case: Case | None,
-        notes: dict[str, list[str]],
-        *,
-        rows_at_rate: bool,
+        self, path: Path, twin: Twin, case: Case | None, notes: Notes, *, rows_at_rate: bool
     ) -> tuple[Trajectories, list[Trajectories]]:
         """The trajectories of one log, and those that the records of a case keep for the test."""
         mapping, names = self.columns.mapping, self.columns.names
@@ -235,20 +225,19 @@ class LogReader:
         return match_twin(found, twin, names, path.name, notes), []
 
     def _by_names(
-        self, path: Path, twin: Twin, notes: dict[str, list[str]], *, rows_at_rate: bool
+        self, path: Path, twin: Twin, notes: Notes, *, rows_at_rate: bool
     ) -> Trajectories:
         """The trajectories of a log whose signals have the names of the twin's channels."""
         columns = self.columns
         log = self._log(path, twin.rate)
         timed = has_times(log, columns.time)
-        require(
-            timed or rows_at_rate,
-            path.name,
-            expected="a column with the times of the rows, or the sample rate",
-            got=f"columns {', '.join(log.signals)}",
-            remedy="give --time COLUMN, or --rate HZ if each row is a sample at that rate",
-        )
-        mapping = mapping_by_names(log, twin, columns.names, table=_is_text(path))
+        expected = "a column with the times of the rows, or the sample rate"
+        got = f"columns {', '.join(log.signals)}"
+        remedy = "give --time COLUMN, or --rate HZ if each row is a sample at that rate"
+        require(timed or rows_at_rate, path.name, expected=expected, got=got, remedy=remedy)
+        suffix = path.suffix.lower()
+        text = suffix in LOGS and not LOGS[suffix].extra  # each row of which has all channels
+        mapping = mapping_by_names(log, twin, columns.names, table=text)
         found = mapped(log, mapping, budget=Budget(path.name, self.max_bytes))
         if len(found) == 1:
             found = found.replace(ids=[path.stem])
@@ -269,9 +258,7 @@ class LogReader:
         return known
 
 
-def _add_notes(
-    found: Trajectories, name: str, notes: dict[str, list[str]], *, whole: bool = False
-) -> None:
+def _add_notes(found: Trajectories, name: str, notes: Notes, *, whole: bool = False) -> None:
     """What was left out while reading a log; `whole` leaves out that nothing was."""
     for note in found.provenance[0].notes:
         nothing = whole and note.startswith("100.0%")
@@ -290,8 +277,3 @@ def _sentences(notes: Mapping[str, Sequence[str]]) -> Iterator[str]:
     for text, files in notes.items():
         more = f" and {len(files) - 2} more" if len(files) > 2 else ""
         yield f"{', '.join(files[:2])}{more}: {text}." if files else text
-
-
-def _is_text(path: Path) -> bool:
-    """Whether it is a table of text, each row of which has all channels."""
-    return path.suffix.lower() in LOGS and not LOGS[path.suffix.lower()].extra

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,10 @@ from retwin.twins.collected import SimulationError
 from retwin.twins.twin import Twin
 from retwin.update.forecast_errors import value_range
 
+Notes = dict[str, list[str]]
+"""What was done while logs were read, and the names of the files to which that applies."""
+Places = list[int | None]
+"""The column of each channel among those of a log; None for one that the log does not have."""
 CONSTANT = "constant in what was read, which therefore shows no dynamics of it."
 """What is noted of channels that never change."""
 
@@ -25,7 +29,7 @@ def match_twin(
     twin: Twin,
     names: Mapping[str, str],
     name: str,
-    notes: dict[str, list[str]],
+    notes: Notes,
     *,
     mapped: bool = False,
 ) -> Trajectories:
@@ -89,12 +93,10 @@ def match_twin(
     except SimulationError as error:
         ends = zip(twin.inputs.names, *value_range(commands), strict=True)
         ranges = ", ".join(f"{channel} {low:.4g} to {high:.4g}" for channel, low, high in ends)
-        raise InputError(
-            name,
-            expected="commands that the twin can simulate",
-            got=f"{ranges}, with which {error}",
-            remedy="is each in the unit of the twin? Otherwise its equations or starts do not hold",
-        ) from error
+        expected = "commands that the twin can simulate"
+        got = f"{ranges}, with which {error}"
+        remedy = "is each in the unit of the twin? Otherwise its equations or starts do not hold"
+        raise InputError(name, expected=expected, got=got, remedy=remedy) from error
     return found.replace(
         commands=commands,
         nominal=nominal,
@@ -108,11 +110,11 @@ def match_twin(
 
 def _places(
     own: Channels, wanted: Channels, names: Mapping[str, str], name: str, prefix: str
-) -> list[int | None]:
+) -> Places:
     """Where each channel of the twin is among those of a log; None where it is not."""
     if own == Channels.numbered(prefix, len(wanted)):
         return list(range(len(wanted)))  # a log whose channels nobody has named
-    places: list[int | None] = []
+    places: Places = []
     for channel in wanted.names:
         column = names.get(channel, channel)
         if channel in names:
@@ -122,12 +124,7 @@ def _places(
 
 
 def _columns(
-    values: NDArray,
-    own: Channels,
-    places: Sequence[int | None],
-    wanted: Channels,
-    name: str,
-    notes: dict[str, list[str]],
+    values: NDArray, own: Channels, places: Places, wanted: Channels, name: str, notes: Notes
 ) -> NDArray:
     """Values (n, T, d) of the channels of the twin in its units; 0 of those that are not there."""
     made = np.zeros((*values.shape[:2], len(places)))
@@ -142,7 +139,7 @@ def _columns(
     return made
 
 
-def _units_taken(own: Channels, wanted: Channels, places: Sequence[int | None]) -> list[str]:
+def _units_taken(own: Channels, wanted: Channels, places: Places) -> list[str]:
     """Channels of a twin without a unit, with the unit that the log has."""
     channels = zip(wanted.names, wanted.units, places, strict=True)
     return [
@@ -152,7 +149,7 @@ def _units_taken(own: Channels, wanted: Channels, places: Sequence[int | None]) 
     ]
 
 
-def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -> Trajectories:
+def usable(found: Trajectories, notes: Notes, transient: float) -> Trajectories:
     """The healthy and the unlabelled trajectories, without their outputs in the first seconds.
 
     Parameters
@@ -171,26 +168,20 @@ def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -
 
     """
     kept = found.maybe_healthy
-    require(
-        kept.any(),
-        "logs",
-        expected=f"a trajectory without a label, or labelled {HEALTHY}",
-        got=f"labels {', '.join(sorted(found.known_labels))}",
-        remedy="identify the parameters of a healthy system",
-    )
+    expected = f"a trajectory without a label, or labelled {HEALTHY}"
+    got = f"labels {', '.join(sorted(found.known_labels))}"
+    remedy = "identify the parameters of a healthy system"
+    require(kept.any(), "logs", expected=expected, got=got, remedy=remedy)
     if not kept.all():
         notes[f"{int((~kept).sum())} trajectories of other classes are not used."] = []
     joined = found[kept]
     _check_size(joined)
     mask = joined.mask.copy()
     mask[:, : round(transient * joined.rate)] = False
-    require(
-        mask.any() or not transient,
-        "transient",
-        expected=f"less than the {joined.steps / joined.rate:g} s of the longest trajectory",
-        got=f"{transient:g} s",
-        remedy="give a shorter transient",
-    )
+    expected = f"less than the {joined.steps / joined.rate:g} s of the longest trajectory"
+    got = f"{transient:g} s"
+    remedy = "give a shorter transient"
+    require(mask.any() or not transient, "transient", expected=expected, got=got, remedy=remedy)
     joined = joined.replace(mask=mask)
     unseen = ~joined.mask.any(axis=(0, 1))
     if unseen.any():
@@ -216,13 +207,11 @@ def _check_size(found: Trajectories, *, largest: float = 1e30) -> None:
         channels = found.outputs if name == "observed" else found.inputs
         if len(large):
             row, sample, channel = large[0]
-            raise InputError(
-                str(found.ids[row]),
-                expected=f"numbers below {largest:g}",
-                got=f"{values[row, sample, channel]:g} for {channels.names[channel]} at "
-                f"{sample / found.rate:g} s",
-                remedy="leave the cell empty, or write NaN, where a measurement is missing",
-            )
+            expected = f"numbers below {largest:g}"
+            got = f"{values[row, sample, channel]:g} for {channels.names[channel]} at "
+            got += f"{sample / found.rate:g} s"
+            remedy = "leave the cell empty, or write NaN, where a measurement is missing"
+            raise InputError(str(found.ids[row]), expected=expected, got=got, remedy=remedy)
 
 
 def _constant(found: Trajectories) -> list[str]:

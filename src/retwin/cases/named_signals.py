@@ -144,13 +144,10 @@ def signals_of(log: Log, channels: Iterable[str], named: Mapping[str, str]) -> d
         ending = [each for each in log.signals if each.endswith((f"/{plain}", f".{plain}"))]
         if exact is None and channel in named and not ending:
             check_there(log.name, wanted, log.signals)
-        require(
-            exact is not None or len(ending) < 2,
-            log.name,
-            expected=f"one signal for {channel}",
-            got=", ".join(ending[:LISTED]),
-            remedy=f"give --column {channel}=NAME",
-        )
+        fits = exact is not None or len(ending) < 2
+        expected = f"one signal for {channel}"
+        remedy = f"give --column {channel}=NAME"
+        require(fits, log.name, expected=expected, got=", ".join(ending[:LISTED]), remedy=remedy)
         if exact is not None or ending:
             found[channel] = exact or ending[0]
     return found
@@ -158,13 +155,9 @@ def signals_of(log: Log, channels: Iterable[str], named: Mapping[str, str]) -> d
 
 def check_there(name: str, column: str, there: Iterable[str]) -> None:
     """Refuse a column that a log lacks."""
-    require(
-        column in there,
-        name,
-        expected=f"a column {column!r}",
-        got=f"columns {_list(there)}",
-        remedy="name the columns as the header of the file does",
-    )
+    expected = f"a column {column!r}"
+    remedy = "name the columns as the header of the file does"
+    require(column in there, name, expected=expected, got=f"columns {_list(there)}", remedy=remedy)
 
 
 def _list(names: Iterable[str]) -> str:
@@ -278,13 +271,11 @@ def _refuse_missing(log: Log, mapping: LogMapping) -> None:
         holes = np.flatnonzero(~np.isfinite(signal.values[:last]))
         if len(holes) or last < 2:
             at = f", none at {signal.times[holes[0]]:g} s" if len(holes) else ""
-            raise InputError(
-                log.name,
-                expected=f"a number for every command until the log ends, two at least; for {name}",
-                got=f"{len(known)} of {last}{at}",
-                remedy="fill in the missing commands, which are known inputs, or give the rows "
-                "before and after them as two logs",
-            )
+            expected = f"a number for every command until the log ends, two at least; for {name}"
+            got = f"{len(known)} of {last}{at}"
+            remedy = "fill in the missing commands, which are known inputs, or give the rows "
+            remedy += "before and after them as two logs"
+            raise InputError(log.name, expected=expected, got=got, remedy=remedy)
 
 
 def has_times(log: Log, time: TimeSettings) -> bool:

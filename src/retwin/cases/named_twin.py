@@ -64,20 +64,13 @@ def imported(name: Any, folder: Path, place: str) -> Any:
         home = import_beside(module, folder)
         found = getattr(home, attribute)
     except (ImportError, AttributeError) as error:
-        raise InputError(
-            place,
-            expected=expected,
-            got=f"{name!r}: {' '.join(str(error).split())}",
-            remedy="check the spelling",
-        ) from None
+        got = f"{name!r}: {' '.join(str(error).split())}"
+        raise InputError(place, expected=expected, got=got, remedy="check the spelling") from None
     beside = folder / f"{module}.py"
     if beside.is_file() and not beside.samefile(home.__file__ or ""):
-        raise InputError(
-            place,
-            expected=f"the module {beside}",
-            got=f"another one of that name, {home.__file__}",
-            remedy="give your module a name of its own",
-        )
+        got = f"another one of that name, {home.__file__}"
+        remedy = "give your module a name of its own"
+        raise InputError(place, expected=f"the module {beside}", got=got, remedy=remedy)
     return found
 
 
@@ -112,11 +105,9 @@ def read_twin(keys: TwinKeys, folder: Path, place: str) -> Twin:
     options = dict(keys.twin) if isinstance(keys.twin, Mapping) else {"name": keys.twin}
     name = options.pop("name", None)
     if not isinstance(name, str):
+        remedy = 'write twin = "NAME", or a table with a name in it'
         raise InputError(
-            own,
-            expected=f"the name of a twin: {twins.FORMS}",
-            got=repr(keys.twin),
-            remedy='write twin = "NAME", or a table with a name in it',
+            own, expected=f"the name of a twin: {twins.FORMS}", got=repr(keys.twin), remedy=remedy
         )
     if "nominal" in options:
         options["nominal"] = imported(options["nominal"], folder, key(own, "nominal"))
@@ -159,13 +150,10 @@ def _of_file(file: Path, keys: TwinKeys, options: dict[str, Any], place: str) ->
     existing(own, file, file.is_file(), "a file")
     chosen = {"inputs": keys.inputs, "outputs": keys.outputs}
     for name, channels in chosen.items():
-        require(
-            not (isinstance(channels, Mapping) and any(channels.values())),
-            key(place, name),
-            expected=f"names alone, since units and limits are those of {file.name}",
-            got=repr(channels),
-            remedy=f"write {name} = [{', '.join(map(repr, channels))}]",
-        )
+        fits = not (isinstance(channels, Mapping) and any(channels.values()))
+        expected = f"names alone, since units and limits are those of {file.name}"
+        remedy = f"write {name} = [{', '.join(map(repr, channels))}]"
+        require(fits, key(place, name), expected=expected, got=repr(channels), remedy=remedy)
     making = _making(options, own, "outside", *(["servos"] if kind is MuJoCoTwin else []))
     settings = checked(kind, options, place=own, besides=(*ELSEWHERE, "outside"))
     if making.servos:
@@ -186,21 +174,12 @@ def _making(options: dict[str, Any], place: str, *names: str) -> _Making:
     return from_settings(_Making, {n: options.pop(n) for n in names if n in options}, place=place)
 
 
-def _channels(
-    given: Mapping[str, Any] | Sequence[str], place: str, *, max_channels: int = 10000
-) -> dict[str, _Channel]:
-    """A table of each channel, for which its name alone may stand.
-
-    Parameters
-    ----------
-    max_channels : int, default 10000
-        Largest number of inputs, and of outputs, in a case.toml: more take minutes to read, and a
-        trajectory takes hundreds of MB.
-
-    """
+def _channels(given: Mapping[str, Any] | Sequence[str], place: str) -> dict[str, _Channel]:
+    """A table of each channel, for which its name alone may stand."""
     tables = given if isinstance(given, Mapping) else {name: {} for name in given}
     remedy = "leave out those that are constant, or split the system"
-    at_most(place, len(tables), max_channels, "channels", remedy=remedy)
+    # More take minutes to read, and a trajectory takes hundreds of MB.
+    at_most(place, len(tables), 10_000, "channels", remedy=remedy)
     return {
         name: from_settings(_Channel, value, place=key(place, name))
         for name, value in tables.items()
@@ -230,12 +209,10 @@ def delayed_twin(twin: Twin, delays: Mapping[str, Parameter], place: str) -> Sta
     Raises InputError for a twin that is no `StateTwin`, and for commands that it does not have.
     """
     if not isinstance(twin, StateTwin):
-        raise InputError(
-            place,
-            expected="dead times of a twin that is a StateTwin",
-            got=f"those of a {type(twin).__name__}",
-            remedy="delay the commands inside the twin, with a parameter of its own",
-        )
+        expected = "dead times of a twin that is a StateTwin"
+        got = f"those of a {type(twin).__name__}"
+        remedy = "delay the commands inside the twin, with a parameter of its own"
+        raise InputError(place, expected=expected, got=got, remedy=remedy)
     with at(place):
         names = {command: each.name for command, each in delays.items()}
         parameters = (*twin.parameters, *delays.values())

@@ -217,12 +217,9 @@ def _parameter(text: str, by_name: dict[str, Known], known: Sequence[Known]) -> 
         if len(start) > 1 or not name:
             raise ValueError
     except ValueError:
-        raise InputError(
-            "--free",
-            expected=f"{FORM}, with numbers",
-            got=repr(text),
-            remedy="write for instance --free damping=0.1:2",
-        ) from None
+        expected = f"{FORM}, with numbers"
+        remedy = "write for instance --free damping=0.1:2"
+        raise InputError("--free", expected=expected, got=repr(text), remedy=remedy) from None
     begin = start[0] if start else found.value
     require(
         start or begin is None or low <= begin <= high,

@@ -73,23 +73,16 @@ class TimeColumn:
         place = f"{table.place}, {record} record"
         cells, _, _ = table.stamps(self.column)
         times = row_times(cells[rows], "", Clock(unit=self.unit), place)
-        require(
-            len(times) >= 2,
-            place,
-            expected=f"two rows at least, with a time in column {self.column!r} of each",
-            got=f"{len(times)} rows",
-            remedy="check column and rows",
-        )
+        expected = f"two rows at least, with a time in column {self.column!r} of each"
+        got = f"{len(times)} rows"
+        require(len(times) >= 2, place, expected=expected, got=got, remedy="check column and rows")
         steps = np.diff(times) * NANOSECOND
         row = int(np.argmax(steps <= 0))
-        require(
-            steps[row] > 0,
-            place,
-            expected=f"times in column {self.column!r} that increase",
-            got=f"{'the same time' if steps[row] == 0 else 'an earlier time'} in data row {row + 1}"
-            f", {steps[row]:g} s after the row before",
-            remedy="sort the rows by time, and keep one of those that were logged twice",
-        )
+        expected = f"times in column {self.column!r} that increase"
+        got = f"{'the same time' if steps[row] == 0 else 'an earlier time'} in data row {row + 1}"
+        got += f", {steps[row]:g} s after the row before"
+        remedy = "sort the rows by time, and keep one of those that were logged twice"
+        require(steps[row] > 0, place, expected=expected, got=got, remedy=remedy)
         ratio = float(np.median(steps)) * rate
         require(
             1 / WRONG_UNIT < ratio < WRONG_UNIT,

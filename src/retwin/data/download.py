@@ -71,13 +71,9 @@ def fetch(
 
     """
     known = _find_file(name, url, sha256)
-    require(
-        known.url.startswith(("http://", "https://")),
-        "url",
-        expected="an address that begins with https:// or http://",
-        got=known.url,
-        remedy="give the address of the file",
-    )
+    fits = known.url.startswith(("http://", "https://"))
+    expected = "an address that begins with https:// or http://"
+    require(fits, "url", expected=expected, got=known.url, remedy="give the address of the file")
     place = Path(folder) if folder else cache_folder()
     target = place / known.file
     if os.path.isfile(target) and sha256_of(target) == known.sha256:
@@ -122,31 +118,20 @@ def _find_file(name: str, url: str | None, sha256: str | None) -> PublicFile:
         return PublicFile(url or known.url, sha256 or known.sha256, known.file)
     plain = Path(name).name == name and name not in ("", ".", "..")
     if url is None or sha256 is None or not plain:
-        raise InputError(
-            "name",
-            expected=f"one of {', '.join(sorted(DOWNLOADS))}",
-            got=repr(name),
-            remedy="choose one of these, or give a file name with its url and sha256",
-        )
+        expected = f"one of {', '.join(sorted(DOWNLOADS))}"
+        remedy = "choose one of these, or give a file name with its url and sha256"
+        raise InputError("name", expected=expected, got=repr(name), remedy=remedy)
     return PublicFile(url, sha256, name)
 
 
-def _download(
-    transfer: Transfer, progress: Progress | None, *, seconds_per_report: float = 0.1
-) -> None:
-    """Wait for a transfer, for `MAX_SECONDS` at most.
-
-    Parameters
-    ----------
-    seconds_per_report : float, default 0.1
-        Time between two looks at the transfer.
-
-    """
+def _download(transfer: Transfer, progress: Progress | None) -> None:
+    """Wait for a transfer, for `MAX_SECONDS` at most."""
     deadline = time.monotonic() + MAX_SECONDS
     transfer.start()
     try:
         while transfer.is_alive():
-            transfer.join(seconds_per_report)
+            # Time between two looks at the transfer.
+            transfer.join(0.1)
             if progress is not None and transfer.share:
                 progress(transfer.share)
             if time.monotonic() > deadline:

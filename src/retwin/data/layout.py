@@ -124,12 +124,9 @@ def rows_of(
     try:
         yield from csv.reader(lines, delimiter=separator, strict=strict)
     except csv.Error as error:
-        raise InputError(
-            place,
-            expected="a table of text",
-            got=brief(error),
-            remedy="check quotation marks, and that it is the right file",
-        ) from None
+        expected = "a table of text"
+        remedy = "check quotation marks, and that it is the right file"
+        raise InputError(place, expected=expected, got=brief(error), remedy=remedy) from None
 
 
 def text_layout(
@@ -239,13 +236,10 @@ def _head(rows: Sequence[Row], width: int, place: str) -> Sequence[Row]:
     full = [(number, row) for number, row in enumerate(rows, 1) if len(_trim(row, width)) == width]
     for number, row in full[1:]:
         filled = [cell.strip() for cell in row if cell.strip()]
-        require(
-            not filled or not all(STARTS.match(cell) for cell in filled),
-            place,
-            expected="numbers in the rows below its header",
-            got=f"{' '.join(filled)[:60]!r} in line {number}",
-            remedy="repair or remove that line",
-        )
+        fits = not filled or not all(STARTS.match(cell) for cell in filled)
+        expected = "numbers in the rows below its header"
+        got = f"{' '.join(filled)[:60]!r} in line {number}"
+        require(fits, place, expected=expected, got=got, remedy="repair or remove that line")
     return [row for _, row in full]
 
 

@@ -92,13 +92,9 @@ def row_times(values: NDArray, unit: str, clock: Clock, where: str) -> NDArray:
     """
     if values.dtype.kind == "M":
         missing = np.isnat(values)
-        require(
-            not missing.any(),
-            where,
-            expected="a time in every row",
-            got=f"none in row {int(np.argmax(missing)) if len(missing) else 0}",
-            remedy="remove that row, or name another column in [time] of the mapping",
-        )
+        got = f"none in row {int(np.argmax(missing)) if len(missing) else 0}"
+        remedy = "remove that row, or name another column in [time] of the mapping"
+        require(not missing.any(), where, expected="a time in every row", got=got, remedy=remedy)
         return values.astype("datetime64[ns]").astype(np.int64)
     if clock.format or clock.unit == "iso":
         return _parse(values, clock.format, where)

@@ -18,6 +18,8 @@ from retwin.errors import InputError
 from retwin.times import sample_rate
 from retwin.workers.threads import in_threads
 
+Speed = Callable[[NDArray, NDArray], NDArray]
+"""From trajectories and steps, each (k,), to the speed (k,) of the commands in these steps."""
 TRAJECTORIES_PER_BLOCK = 32
 """Trajectories per pass over the commands, few enough that their samples fit the cache."""
 
@@ -60,12 +62,10 @@ class Segments:
         following = self.stop[:, :-1] <= self.start[:, 1:]
         if not (ordered.all() and following.all()):
             wrong = ~(ordered.all(axis=1) & following.all(axis=1))
-            raise InputError(
-                "segments",
-                expected="start <= settle <= stop <= next start in every trajectory",
-                got=f"trajectory {int(np.argmax(wrong))} out of order",
-                remedy="sort the segments by time and let none overlap",
-            )
+            expected = "start <= settle <= stop <= next start in every trajectory"
+            got = f"trajectory {int(np.argmax(wrong))} out of order"
+            remedy = "sort the segments by time and let none overlap"
+            raise InputError("segments", expected=expected, got=got, remedy=remedy)
 
     def __len__(self) -> int:
         return len(self.start)
@@ -122,12 +122,10 @@ class Segments:
         valid = np.isfinite(start) & np.isfinite(settle)
         outside = valid & ((start < 0) | (settle > steps))
         if outside.any():
-            raise InputError(
-                "segments",
-                expected=f"times between 0 and {steps / rate:g} s",
-                got=f"{start[outside][0] / rate:g} to {settle[outside][0] / rate:g} s",
-                remedy="give onsets and settle times in seconds, not samples",
-            )
+            expected = f"times between 0 and {steps / rate:g} s"
+            got = f"{start[outside][0] / rate:g} to {settle[outside][0] / rate:g} s"
+            remedy = "give onsets and settle times in seconds, not samples"
+            raise InputError("segments", expected=expected, got=got, remedy=remedy)
         start = np.where(valid, start, steps)
         settle = np.where(valid, settle, steps)
         stop = np.concatenate([start[:, 1:], np.full((len(start), 1), float(steps))], axis=1)
@@ -201,9 +199,7 @@ class Segments:
         return cls._from_moving(moving, lambda row, step: speed[row, step])
 
     @classmethod
-    def _from_moving(
-        cls, moving: NDArray, speed: Callable[[NDArray, NDArray], NDArray]
-    ) -> Segments:
+    def _from_moving(cls, moving: NDArray, speed: Speed) -> Segments:
         """Segments whose motion part is where `moving` (n, T - 1) is True.
 
         `speed` gives the speeds of trajectories in steps, for arrays of their indices.
@@ -214,14 +210,7 @@ class Segments:
         return cls.from_edges(len(moving), moving.shape[1] + 1, row, edge, speed)
 
     @classmethod
-    def from_edges(
-        cls,
-        n: int,
-        steps: int,
-        row: NDArray,
-        edge: NDArray,
-        speed: Callable[[NDArray, NDArray], NDArray],
-    ) -> Segments:
+    def from_edges(cls, n: int, steps: int, row: NDArray, edge: NDArray, speed: Speed) -> Segments:
         """Segments of n trajectories from the samples at which they begin and cease to move.
 
         Parameters
@@ -249,13 +238,7 @@ class Segments:
         return cls(start, np.minimum(settle, stop), stop, valid, steps)
 
 
-def _rest(
-    speed: Callable[[NDArray, NDArray], NDArray],
-    row: NDArray,
-    steps: int,
-    edge: NDArray,
-    inner: NDArray,
-) -> NDArray:
+def _rest(speed: Speed, row: NDArray, steps: int, edge: NDArray, inner: NDArray) -> NDArray:
     """The fraction (0 … 1) of the step `edge` at rest, given that `inner` moves all the time."""
     inside = (inner >= 0) & (inner < steps)
     full = speed(row, np.clip(inner, 0, steps - 1))

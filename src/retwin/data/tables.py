@@ -92,31 +92,21 @@ class Table:
         """
         name = clock.column or ("" if clock.rate else time_column(self.units))
         names = list(self.units)
-        require(
-            name in names or (not name and (clock.rate or clock.otherwise)),
-            self.place,
-            expected=f"a column of times{f' {clock.column!r}' * bool(clock.column)}",
-            got=f"the columns {', '.join(names[:12])}{', …' * (len(names) > 12)}",
-            remedy="name it in the mapping: [time] column = …, or give the rows per s: rate = …",
-        )
+        fits = name in names or (not name and (clock.rate or clock.otherwise))
+        expected = f"a column of times{f' {clock.column!r}' * bool(clock.column)}"
+        got = f"the columns {', '.join(names[:12])}{', …' * (len(names) > 12)}"
+        remedy = "name it in the mapping: [time] column = …, or give the rows per s: rate = …"
+        require(fits, self.place, expected=expected, got=got, remedy=remedy)
         return name
 
     def stamps(self, name: str) -> tuple[NDArray, str, str]:
         """The cells of a column of times, their unit, and the column for messages."""
         return self.cells(name), self.units[name] or unit_in(name), f"{self.place}, column {name!r}"
 
-    def signals(
-        self, clock: Clock, wanted: frozenset[str] | None, *, text_share: float = 0.5
-    ) -> Iterator[Signal | Skipped]:
+    def signals(self, clock: Clock, wanted: frozenset[str] | None) -> Iterator[Signal | Skipped]:
         """The signals of the columns that are wanted, of all where that is None.
 
         Raises InputError where there is no column of times, or it holds something else.
-
-        Parameters
-        ----------
-        text_share : float, default 0.5
-            The share of cells that are no numbers from which a column is text.
-
         """
         if wanted is None and not (clock.column or clock.rate or clock.otherwise):
             clock = Clock(self._likely_times(), clock.unit, clock.format)
@@ -136,7 +126,8 @@ class Table:
                 yield Skipped(title, self.others[title])
             else:
                 values, bad = self.numbers(title)
-                text = self.rows and bad.sum() > text_share * self.rows
+                # The share of cells that are no numbers from which a column is text.
+                text = self.rows and bad.sum() > 0.5 * self.rows
                 yield (
                     Skipped(title, "text")
                     if text
@@ -250,12 +241,10 @@ def _blocks(path: Path, layout: Layout, *, empty: bool, strict: bool) -> Iterato
             try:
                 block.append(layout.whole(row))
             except ValueError:
-                raise InputError(
-                    path.name,
-                    expected=f"{len(layout.names)} cells in every row, as in its header",
-                    got=f"{len(row)} in line {number}",
-                    remedy="repair or remove that line; the last one of a log may be cut off",
-                ) from None
+                expected = f"{len(layout.names)} cells in every row, as in its header"
+                got = f"{len(row)} in line {number}"
+                remedy = "repair or remove that line; the last one of a log may be cut off"
+                raise InputError(path.name, expected=expected, got=got, remedy=remedy) from None
             if len(block) == BLOCK:
                 yield block
                 block = []

@@ -147,13 +147,10 @@ class Trajectories:
         n = len(commands)
         labels = named("labels", self.labels, [UNLABELLED] * n)
         ids = named("ids", self.ids, [f"{i:05d}" for i in range(n)])
-        require(
-            len(set(ids.tolist())) == n,
-            "ids",
-            expected="one unique name per trajectory",
-            got="a name that repeats",
-            remedy="leave ids out to have them numbered",
-        )
+        expected = "one unique name per trajectory"
+        got = "a name that repeats"
+        remedy = "leave ids out to have them numbered"
+        require(len(set(ids.tolist())) == n, "ids", expected=expected, got=got, remedy=remedy)
         inputs = self.inputs or Channels.numbered("u", commands.shape[2])
         outputs = self.outputs or Channels.numbered("y", nominal.shape[2])
         for name, channels, width in (
@@ -262,13 +259,10 @@ class Trajectories:
         """
         end = self.steps / self.rate
         times = (start, end if stop is None else stop)
-        require(
-            0 <= times[0] < times[1] <= end,
-            "start, stop",
-            expected=f"times in s, in order, from 0 to {end:g}",
-            got=f"{start} to {stop}",
-            remedy="count the seconds from the first sample",
-        )
+        fits = 0 <= times[0] < times[1] <= end
+        expected = f"times in s, in order, from 0 to {end:g}"
+        remedy = "count the seconds from the first sample"
+        require(fits, "start, stop", expected=expected, got=f"{start} to {stop}", remedy=remedy)
         span = slice(*(to_samples(each, self.rate) for each in times))
         arrays = {name: getattr(self, name)[:, span] for name in PER_SAMPLE}
         return self.replace(**arrays)
@@ -299,24 +293,17 @@ class Trajectories:
 
         """
         first, second = self.split_index(fraction, seed=seed)
-        require(
-            len(first) and len(second),
-            "fraction",
-            expected=f"a share that leaves some of the {len(self)} trajectories to both sets",
-            got=f"{fraction!r}, which gives {len(first)} and {len(second)}",
-            remedy="give another share, or more trajectories",
-        )
+        expected = f"a share that leaves some of the {len(self)} trajectories to both sets"
+        got = f"{fraction!r}, which gives {len(first)} and {len(second)}"
+        remedy = "give another share, or more trajectories"
+        require(len(first) and len(second), "fraction", expected=expected, got=got, remedy=remedy)
         return self[first], self[second]
 
     def split_index(self, fraction: float, *, seed: int) -> tuple[NDArray, NDArray]:
         """The sorted indices of the two sets that `split` gives."""
-        require(
-            0 < fraction < 1,
-            "fraction",
-            expected="a number strictly between 0 and 1",
-            got=repr(fraction),
-            remedy="give the share of the first part",
-        )
+        expected = "a number strictly between 0 and 1"
+        remedy = "give the share of the first part"
+        require(0 < fraction < 1, "fraction", expected=expected, got=repr(fraction), remedy=remedy)
         rng = np.random.default_rng(seed)
         first = np.zeros(len(self), dtype=bool)
         taken = 0.0

@@ -71,7 +71,7 @@ class Study:
         for name in self.results.sources:
             self._require({f"probabilities/{name}": (None, n, classes)})
         for name, fidelity in self.results.fidelity.items():
-            self._require(_fidelity_shapes(name, fidelity, self.arrays, self.bands(name)))
+            self._require(self._fidelity_shapes(name, fidelity))
         self._check_overlay()
         if "simulation/observed" in self.arrays:
             self._check_simulations()
@@ -93,6 +93,22 @@ class Study:
                 got="none" if got is None else f"shape {got}",
                 remedy=AGAIN,
             )
+
+    def _fidelity_shapes(self, source: str, fidelity: FidelityResults) -> dict[str, Shape]:
+        """The shapes of the arrays on the draws of a source."""
+        z, bands = self.arrays.get(f"z/{source}/observed"), self.bands(source)
+        both = f"z/{source}/observed", f"z/{source}/predicted"
+        shapes: dict[str, Shape] = dict.fromkeys(both, (None, len(fidelity.latents)))
+        if z is not None:
+            shapes[f"z/{source}/trajectory"] = z.shape[:1]
+        shapes[f"pit/{source}"] = (3, None)
+        if bands:
+            count, samples = bands["seen"].shape
+            full = (samples, len(fidelity.outputs))
+            sizes = {"nominal": full, "observed": full, "quantiles": (5, *full), "ids": ()}
+            shapes |= {f"bands/{source}/{name}": (count, *rest) for name, rest in sizes.items()}
+            shapes[f"bands/{source}/rate"] = ()
+        return shapes
 
     def _check_overlay(self) -> None:
         overlay, bands = self.results.overlay, self.arrays.get("portrait/bands")
@@ -219,28 +235,6 @@ class Study:
             Component(name, unit, *(factor * each[:, i] for each in both if each is not None))
             for i, (name, (factor, unit)) in enumerate(zip(fidelity.latents, units, strict=True))
         ]
-
-
-def _fidelity_shapes(
-    source: str,
-    fidelity: FidelityResults,
-    arrays: Mapping[str, NDArray],
-    bands: Mapping[str, NDArray],
-) -> dict[str, Shape]:
-    """The shapes of the arrays on the draws of a source."""
-    z, latents = arrays.get(f"z/{source}/observed"), len(fidelity.latents)
-    both = f"z/{source}/observed", f"z/{source}/predicted"
-    shapes: dict[str, Shape] = dict.fromkeys(both, (None, latents))
-    if z is not None:
-        shapes[f"z/{source}/trajectory"] = z.shape[:1]
-    shapes[f"pit/{source}"] = (3, None)
-    if bands:
-        count, samples = bands["seen"].shape
-        full = (samples, len(fidelity.outputs))
-        sizes = {"nominal": full, "observed": full, "quantiles": (5, *full), "ids": ()}
-        shapes |= {f"bands/{source}/{name}": (count, *rest) for name, rest in sizes.items()}
-        shapes[f"bands/{source}/rate"] = ()
-    return shapes
 
 
 def read_study(folder: str | os.PathLike[str]) -> Study:

@@ -88,13 +88,9 @@ def run_study(
     """
     cores = os.cpu_count() or 1
     workers = whole("processes", cores if processes is None else processes, at_least=1)
-    require(
-        processes is None or scheduler is None,
-        "processes",
-        expected="none with a scheduler, which has its own",
-        got=processes,
-        remedy="leave one of the two out",
-    )
+    fits = processes is None or scheduler is None
+    expected = "none with a scheduler, which has its own"
+    require(fits, "processes", expected=expected, got=processes, remedy="leave one of the two out")
     out = Path(out)
     report = report or (lambda _stage, _share: None)
     with in_use(out):
@@ -105,7 +101,20 @@ def run_study(
         work_folder = out / "work"
         stages = Stages(report, expected_seconds(plan, workers), workers)
         if not (work_folder / "roles.json").exists():
-            _prepare(case, plan, data, out, found, stages.prepare)
+            real, roles = real_data(case, plan, data, stages.prepare)
+            roles = roles.first_of_each(real.labels, plan.calibrated)
+            _check_healthy(plan, real, roles)
+            twin = twin_data(case, plan, data, stages.prepare)
+            remedy = "give more of them, or a larger per_class"
+            at_least("twin-data", twin, MIN_TRAJECTORIES, "trajectories of the twin", remedy=remedy)
+            _check_classes(case, plan, twin)
+            # Nothing is written before everything is checked. A set that may not fit into memory
+            # stays in Zarr, which is read in chunks. The roles mark the folder as complete.
+            write_json(out / "study.json", {"retwin": __version__, **found})
+            save(real, work_folder / "real.npz")
+            large = data.twin is not None and (data.twin / "zarr.json").exists()
+            save(twin, work_folder / ("twin.zarr" if large else "twin.npz"))
+            write_json(work_folder / "roles.json", roles.folds)
         roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))
         _check_healthy(plan, Files(work_folder).real_data(), roles)
         work = Work(work_folder.resolve(), case, plan, roles)
@@ -219,34 +228,6 @@ def possible_sources(case: Case, plan: StudyPlan) -> tuple[str, ...]:
     return tuple(name for name in SOURCES if not lacking(name, case, plan))
 
 
-def _prepare(
-    case: Case,
-    plan: StudyPlan,
-    data: StudyData,
-    out: Path,
-    found: Mapping[str, Any],
-    report: Report,
-) -> None:
-    """Read and check all data, then write them with commands for the jobs, and the roles.
-
-    Nothing is written before everything is checked. The roles are written last, so that their
-    file marks the folder as complete.
-    """
-    real, roles = real_data(case, plan, data, report)
-    roles = roles.first_of_each(real.labels, plan.calibrated)
-    _check_healthy(plan, real, roles)
-    twin = twin_data(case, plan, data, report)
-    remedy = "give more of them, or a larger per_class"
-    at_least("twin-data", twin, MIN_TRAJECTORIES, "trajectories of the twin", remedy=remedy)
-    _check_classes(case, plan, twin)
-    write_json(out / "study.json", {"retwin": __version__, **found})
-    save(real, out / "work" / "real.npz")
-    # A set that may not fit into memory stays in Zarr, which is read in chunks.
-    large = data.twin is not None and (data.twin / "zarr.json").exists()
-    save(twin, out / "work" / ("twin.zarr" if large else "twin.npz"))
-    write_json(out / "work" / "roles.json", roles.folds)
-
-
 def _about(
     case: Case, plan: StudyPlan, data: StudyData, digests: Mapping[str, dict[str, str]]
 ) -> dict[str, Any]:
@@ -272,23 +253,17 @@ def _check_healthy(plan: StudyPlan, real: Trajectories, roles: Roles) -> None:
     if not needed or plan.calibrate_on == "all":
         return
     for calibration, _ in roles.folds:
-        require(
-            (real.labels[list(calibration)] == HEALTHY).any(),
-            "calibration",
-            expected=f"at least one trajectory labelled {HEALTHY!r} in every calibration part",
-            got="none",
-            remedy="label healthy trajectories, give more of them, or calibrate on 'all'",
-        )
+        fits = (real.labels[list(calibration)] == HEALTHY).any()
+        expected = f"at least one trajectory labelled {HEALTHY!r} in every calibration part"
+        remedy = "label healthy trajectories, give more of them, or calibrate on 'all'"
+        require(fits, "calibration", expected=expected, got="none", remedy=remedy)
 
 
 def _check_classes(case: Case, plan: StudyPlan, twin: Trajectories) -> None:
     """Require trajectories of the twin of every class, if a source learns the classes from them."""
     learning = [name for name in plan.sources if SOURCES[name].recorded]
     absent = [label for label in case.classes if label not in twin.known_labels]
-    require(
-        not (learning and absent),
-        "twin-data",
-        expected=f"trajectories of every class, from which {', '.join(learning)} would learn them",
-        got=f"none of {', '.join(absent)}",
-        remedy="add them, or leave these sources out: the others need healthy trajectories only",
-    )
+    expected = f"trajectories of every class, from which {', '.join(learning)} would learn them"
+    got = f"none of {', '.join(absent)}"
+    remedy = "add them, or leave these sources out: the others need healthy trajectories only"
+    require(not (learning and absent), "twin-data", expected=expected, got=got, remedy=remedy)

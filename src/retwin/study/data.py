@@ -67,13 +67,10 @@ class StudyData:
             remedy="give --real LOG, or --calibration LOG --test LOG; or leave the mapping out",
         )
         stated -= {"mapping"}
-        require(
-            stated in ({"calibration", "test"}, {"real"}, {"records"}, set()),
-            "real data",
-            expected="either calibration and test, or real alone, or records alone",
-            got=", ".join(sorted(stated)),
-            remedy="give --calibration FILE --test FILE, or --real FILE --folds K, or --data FILE",
-        )
+        fits = stated in ({"calibration", "test"}, {"real"}, {"records"}, set())
+        expected = "either calibration and test, or real alone, or records alone"
+        remedy = "give --calibration FILE --test FILE, or --real FILE --folds K, or --data FILE"
+        require(fits, "real data", expected=expected, got=", ".join(sorted(stated)), remedy=remedy)
 
 
 def twin_data(case: Case, plan: StudyPlan, data: StudyData, report: Report) -> Trajectories:
@@ -111,12 +108,9 @@ def real_data(
         seed = plan.seed_of("emulated", 0)
         real = _emulate(case, plan.emulated_healthy, seed)
     else:
-        raise InputError(
-            "real data",
-            expected="measured trajectories",
-            got=f"none, and the case {case.name!r} has no emulator",
-            remedy="give --real FILE --folds K",
-        )
+        got = f"none, and the case {case.name!r} has no emulator"
+        remedy = "give --real FILE --folds K"
+        raise InputError("real data", expected="measured trajectories", got=got, remedy=remedy)
     # Copies have no role: a fold would be tested by what the others were calibrated on.
     first = distinct_records(real.measured)
     folds = real[first].folds(plan.folds, seed=plan.seed_of("folds", 0))

@@ -122,13 +122,10 @@ class StudyPlan:
         one_of("calibrate_on", self.calibrate_on, CALIBRATE_ON)
         for source in self.sources:
             one_of("sources", source, SOURCES)
-        require(
-            0 < len(self.sources) == len(set(self.sources)),
-            "sources",
-            expected="at least one source, none twice",
-            got=self.sources,
-            remedy=f"choose from {', '.join(SOURCES)}",
-        )
+        fits = 0 < len(self.sources) == len(set(self.sources))
+        expected = "at least one source, none twice"
+        remedy = f"choose from {', '.join(SOURCES)}"
+        require(fits, "sources", expected=expected, got=self.sources, remedy=remedy)
         whole("runs", self.number_of_runs, at_least=1, at_most=MAX_RUNS)
         whole("seed", self.seed)
         whole("folds", self.folds, at_least=2)

@@ -131,11 +131,9 @@ def _do_on_cluster(work: Work, job: Job) -> None:
     _one_thread()
     roles = work.folder / "roles.json"
     seen = roles.read_text("utf-8") if roles.exists() else "no such file"
-    require(
-        roles.exists() and Roles.of(json.loads(seen)) == work.roles,
-        "out",
-        expected="a folder that all workers see at the same path",
-        got=f"{roles}, of which {platform.node()} sees {'another one' if roles.exists() else seen}",
-        remedy="share the folder with all machines of the cluster, or leave --scheduler out",
-    )
+    fits = roles.exists() and Roles.of(json.loads(seen)) == work.roles
+    expected = "a folder that all workers see at the same path"
+    got = f"{roles}, of which {platform.node()} sees {'another one' if roles.exists() else seen}"
+    remedy = "share the folder with all machines of the cluster, or leave --scheduler out"
+    require(fits, "out", expected=expected, got=got, remedy=remedy)
     work.do(job)

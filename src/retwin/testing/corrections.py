@@ -13,6 +13,7 @@ from retwin import checks
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
 from retwin.testing.suite import (
+    checks_in,
     quiet_randomness,
     require,
     require_alike,
@@ -300,19 +301,7 @@ def check_arguments_kept(subject: CorrectionSubject) -> None:
     require_same(again.z.numpy(), subject.clean.z.numpy(), "infer must give the same bytes again")
 
 
-CORRECTION_CHECKS: tuple[Callable[[CorrectionSubject], None], ...] = (
-    check_protocol,
-    check_latent,
-    check_zero,
-    check_apply,
-    check_gradient,
-    check_batch,
-    check_no_segment,
-    check_discrepancy,
-    check_recovery,
-    check_mask,
-    check_arguments_kept,
-)
+CORRECTION_CHECKS: tuple[Callable[[CorrectionSubject], None], ...] = checks_in(globals())
 
 
 def check_correction(correction: Correction, context: Context, z: Tensor) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.testing.suite import (
+    checks_in,
     quiet_randomness,
     require,
     require_alike,
@@ -47,12 +48,9 @@ class DiagnoserSubject:
 
     def __post_init__(self) -> None:
         if len(self.trajectories) < 2:
-            raise InputError(
-                "trajectories",
-                expected="at least two",
-                got=f"{len(self.trajectories)}",
-                remedy="give a few of the kind on which the diagnoser was fitted",
-            )
+            got = f"{len(self.trajectories)}"
+            remedy = "give a few of the kind on which the diagnoser was fitted"
+            raise InputError("trajectories", expected="at least two", got=got, remedy=remedy)
 
     def predict(self, trajectories: Trajectories | None = None) -> NDArray:
         """Probabilities (n, classes), by default of the subject's trajectories."""
@@ -156,15 +154,7 @@ def check_same_again(subject: DiagnoserSubject) -> None:
     require_same(second, first, "predict_proba must give the same bytes again")
 
 
-DIAGNOSER_CHECKS: tuple[Callable[[DiagnoserSubject], None], ...] = (
-    check_protocol,
-    check_probabilities,
-    check_blindness,
-    check_batch,
-    check_missing,
-    check_other_data,
-    check_same_again,
-)
+DIAGNOSER_CHECKS: tuple[Callable[[DiagnoserSubject], None], ...] = checks_in(globals())
 
 
 def check_diagnoser(diagnoser: Diagnoser, trajectories: Trajectories) -> None:

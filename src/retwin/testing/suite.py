@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -57,12 +57,7 @@ def require_same(got: NDArray, wanted: NDArray, message: str) -> None:
 
 
 def require_alike(
-    got: ArrayLike,
-    wanted: ArrayLike,
-    message: str,
-    *,
-    tolerance: float = 1e-5,
-    floor: float = 1e-6,
+    got: ArrayLike, wanted: ArrayLike, message: str, *, tolerance: float = 1e-5, floor: float = 1e-6
 ) -> None:
     """Assert that two arrays are equal up to rounding.
 
@@ -164,6 +159,11 @@ def _generators() -> dict[str, object]:
     if torch := sys.modules.get("torch"):
         states["torch"] = torch.get_rng_state().numpy().tobytes()
     return states
+
+
+def checks_in(module: Mapping[str, Any]) -> tuple[Callable[[Any], None], ...]:
+    """The contract that a module states, given its names: its functions `check_…`, in order."""
+    return tuple(each for name, each in module.items() if name.startswith("check_"))
 
 
 def run_checks(checks: Iterable[Callable[[Subject], None]], subject: Subject, title: str) -> None:

@@ -45,25 +45,20 @@ class TwinSubject:
 
     def __post_init__(self) -> None:
         shape = np.shape(self.commands)
-        require(
-            len(shape) == 3 and shape[0] >= 2 and shape[1] >= 8,
-            "commands",
-            expected="numbers of shape (n, T, d_u), n at least 2 and T at least 8",
-            got=f"shape {shape}",
-            remedy="give a few short trajectories that the twin can follow",
-        )
+        fits = len(shape) == 3 and shape[0] >= 2 and shape[1] >= 8
+        expected = "numbers of shape (n, T, d_u), n at least 2 and T at least 8"
+        remedy = "give a few short trajectories that the twin can follow"
+        require(fits, "commands", expected=expected, got=f"shape {shape}", remedy=remedy)
         if not self.faults:
             rate = getattr(self.twin, "rate", 1.0)  # a twin without one fails its first check
             stuck = [_stuck(each, number, rate) for number, each in enumerate(self.commands[1:])]
             object.__setattr__(self, "faults", (None, *stuck))
         healthy = sum(fault is None for fault in self.faults)
-        require(
-            len(self.faults) == shape[0] and 0 < healthy < shape[0],
-            "faults",
-            expected=f"{shape[0]}, one per trajectory, some None and some not",
-            got=f"{len(self.faults)}, {healthy} of them None",
-            remedy="give None for a healthy trajectory, or leave faults out",
-        )
+        fits = len(self.faults) == shape[0] and 0 < healthy < shape[0]
+        expected = f"{shape[0]}, one per trajectory, some None and some not"
+        got = f"{len(self.faults)}, {healthy} of them None"
+        remedy = "give None for a healthy trajectory, or leave faults out"
+        require(fits, "faults", expected=expected, got=got, remedy=remedy)
 
     def simulate(
         self,

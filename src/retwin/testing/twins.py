@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.testing.suite import (
+    checks_in,
     quiet_randomness,
     require,
     require_alike,
@@ -271,27 +272,7 @@ def check_pickle(subject: TwinSubject) -> None:
     require_same(got, wanted, "a copy from pickle must simulate the same")
 
 
-TWIN_CHECKS: tuple[Callable[[TwinSubject], None], ...] = (
-    check_protocol,
-    check_result,
-    check_labels,
-    check_seed,
-    check_severities,
-    check_nominal,
-    check_faults_act,
-    check_batch,
-    check_arguments_kept,
-    check_number_types,
-    check_lengths,
-    check_too_short,
-    check_progress,
-    check_bad_commands,
-    check_bad_faults,
-    check_bad_seed,
-    check_limits,
-    check_global_randomness,
-    check_pickle,
-)
+TWIN_CHECKS: tuple[Callable[[TwinSubject], None], ...] = checks_in(globals())
 
 
 def check_twin(twin: Twin, commands: NDArray, faults: Sequence[Fault | None] = ()) -> None:

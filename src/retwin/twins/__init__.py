@@ -130,7 +130,10 @@ def _check_none(name: str, options: Mapping[str, Any]) -> None:
 def _from_module(
     name: str, inputs: Sequence[str], outputs: Sequence[str], rate: float | None
 ) -> Twin:
-    """The twin that an entry of the catalog, or an object of a module, is or makes."""
+    """The twin that an entry of the catalog, or an object of a module, is or makes.
+
+    The channels of a function have the unit "1".
+    """
     from retwin.twins.twin import Twin
 
     try:
@@ -139,35 +142,22 @@ def _from_module(
         raise _unknown(name, str(error)) from None
     found = made_by(found)
     if takes_commands(found):
-        return _of_function(name, found, inputs, outputs, rate)
+        if not inputs or not outputs or not rate:
+            expected = "inputs, outputs and rate, which a function does not have"
+            got = f"inputs {list(inputs)}, outputs {list(outputs)}, rate {rate}"
+            remedy = "name the channels and the rate, or name an object that is a FunctionTwin"
+            raise InputError(f"twin {name!r}", expected=expected, got=got, remedy=remedy)
+        from retwin.twins.function import FunctionTwin
+
+        _check_one_array(name, found, inputs)
+        us, ys = (Channels(tuple(n), ("1",) * len(n)) for n in (inputs, outputs))
+        return FunctionTwin(found, us, ys, rate)
     if not isinstance(found, Twin):
         raise _unknown(name, f"a {type(found).__name__}")
     given = (*inputs, *outputs, *([f"{rate} Hz"] if rate is not None else []))
     expected = "neither channels nor a rate, since it has its own"
     nothing(f"twin {name!r}", given, expected, remedy="leave them out")
     return found
-
-
-def _of_function(
-    name: str,
-    function: Callable[..., Any],
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    rate: float | None,
-) -> Twin:
-    """The twin of a function, whose channels have the unit "1"."""
-    if not inputs or not outputs or not rate:
-        raise InputError(
-            f"twin {name!r}",
-            expected="inputs, outputs and rate, which a function does not have",
-            got=f"inputs {list(inputs)}, outputs {list(outputs)}, rate {rate}",
-            remedy="name the channels and the rate, or name an object that is a FunctionTwin",
-        )
-    from retwin.twins.function import FunctionTwin
-
-    _check_one_array(name, function, inputs)
-    commands, results = (Channels(tuple(n), ("1",) * len(n)) for n in (inputs, outputs))
-    return FunctionTwin(function, commands, results, rate)
 
 
 def _check_one_array(name: str, function: Callable[..., Any], inputs: Sequence[str]) -> None:
@@ -177,13 +167,11 @@ def _check_one_array(name: str, function: Callable[..., Any], inputs: Sequence[s
         signature.bind(0, **{each: 0 for each in ("rng", "rate") if each in signature.parameters})
     except TypeError as error:
         passed = ", ".join(f"{each}=u[..., {i}]" for i, each in enumerate(inputs))
-        raise InputError(
-            f"twin {name!r}",
-            expected="a function of one array of commands u, (n, T, d_u), and of numbers with "
-            "defaults",
-            got=f"{name.rpartition(':')[2]}{signature}, {error}",
-            remedy=f"name a function of u that calls it by names, with {passed}",
-        ) from None
+        expected = "a function of one array of commands u, (n, T, d_u), and of numbers with "
+        expected += "defaults"
+        got = f"{name.rpartition(':')[2]}{signature}, {error}"
+        remedy = f"name a function of u that calls it by names, with {passed}"
+        raise InputError(f"twin {name!r}", expected=expected, got=got, remedy=remedy) from None
     except ValueError:  # some compiled functions have no signature
         return
 

@@ -15,18 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from pebble import ProcessExpired, ProcessPool
 
 from retwin.checks import require
-from retwin.data.trajectories import Channels, Trajectories
+from retwin.data.trajectories import Channels
 from retwin.errors import InputError
-from retwin.progress import Progress
 from retwin.times import sample_rate
-from retwin.twins.faults.actuator_faults import Fault
 from retwin.twins.limits import Limits
-from retwin.twins.twin import Chunk, simulate_in_chunks
-from retwin.twins.workers import keep_workers, worker_processes
+from retwin.twins.twin import Chunk, ChunkedTwin
+from retwin.twins.workers import worker_processes
 from retwin.workers.pools import check_sendable, sendable_errors, worker_pool
-
-TRAJECTORIES_PER_CHUNK = 128
-"""Number of trajectories that a vectorised function gets at once."""
 
 IMPORTABLE = {
     "expected": "a function that worker processes can import",
@@ -38,7 +33,7 @@ Function = Callable[..., ArrayLike]
 
 
 @dataclass(frozen=True)
-class FunctionTwin:
+class FunctionTwin(ChunkedTwin):
     """A twin that is a Python function.
 
     Parameters
@@ -74,7 +69,9 @@ class FunctionTwin:
     -----
     The actuators inside the function cannot be accessed, so a frozen response is a held command.
     Random numbers depend on the seed and on the index of the (first) trajectory: the same seed
-    gives the same bytes for any number of workers.
+    gives the same bytes for any number of workers. `simulate` passes on exceptions of the function
+    unchanged, raises InputError when it returns another shape, no numbers, NaN or infinite values,
+    and SimulationError when the worker processes of some trajectories died.
 
     """
 
@@ -90,75 +87,34 @@ class FunctionTwin:
 
     def __post_init__(self) -> None:
         for role, given in (("function", self.function), ("nominal", self.nominal)):
-            require(
-                callable(given) or (role == "nominal" and given is None),
-                role,
-                expected="something that can be called with commands",
-                got=repr(given),
-                remedy="give a function of the commands that returns the outputs",
-            )
-        require(
-            self.nominal is not None or not _takes(self.function, "rng"),
-            "nominal",
-            expected=f"a function for the ideal output, since {_name(self.function)} is random",
-            got="None",
-            remedy="give nominal=, the same without noise",
-        )
+            fits = callable(given) or (role == "nominal" and given is None)
+            expected = "something that can be called with commands"
+            remedy = "give a function of the commands that returns the outputs"
+            require(fits, role, expected=expected, got=repr(given), remedy=remedy)
+        fits = self.nominal is not None or not _takes(self.function, "rng")
+        expected = f"a function for the ideal output, since {_name(self.function)} is random"
+        remedy = "give nominal=, the same without noise"
+        require(fits, "nominal", expected=expected, got="None", remedy=remedy)
         sample_rate("rate", self.rate)
-        require(
-            self.workers >= 1 and (self.workers == 1 or not self.vectorised),
-            "workers",
-            expected="1, or more for a function of one trajectory",
-            got=f"{self.workers} with vectorised={self.vectorised}",
-            remedy="leave workers out, or give vectorised=False",
-        )
+        fits = self.workers >= 1 and (self.workers == 1 or not self.vectorised)
+        expected = "1, or more for a function of one trajectory"
+        got = f"{self.workers} with vectorised={self.vectorised}"
+        remedy = "leave workers out, or give vectorised=False"
+        require(fits, "workers", expected=expected, got=got, remedy=remedy)
         if self.workers > 1:
             check_sendable(self.function, "function", **IMPORTABLE)
             check_sendable(self.nominal, "nominal", **IMPORTABLE)
 
-    def simulate(
-        self,
-        commands: NDArray,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int,
-        progress: Progress | None = None,
-    ) -> Trajectories:
-        """See `Twin.simulate`; exceptions of the function are passed on unchanged.
-
-        Raises
-        ------
-        InputError
-            As `Twin.simulate`, and when the function returns another shape, no numbers, NaN or
-            infinite values.
-        SimulationError
-            The worker processes of some trajectories died.
-
-        """
-
-        def report(chunk: Chunk, fraction: float) -> None:
-            if progress is not None:
-                done = chunk.index.start + fraction * len(chunk.commands)
-                progress(done / len(commands))
-
-        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            if self.workers == 1:
-                return self._run(None, chunk, report)
-            # No process is started before commands and faults are found good.
-            key = (FunctionTwin, self.workers)  # processes can serve every function
-            with worker_processes(key, lambda: worker_pool(self.workers)) as pool:
-                return self._run(pool, chunk, report)
-
-        size = TRAJECTORIES_PER_CHUNK
-        with keep_workers():
-            return simulate_in_chunks(
-                self, run, commands, faults, seed=seed, progress=progress, size=size
-            )
-
-    def _run(
-        self, pool: ProcessPool | None, chunk: Chunk, report: Callable
-    ) -> tuple[NDArray, NDArray]:
+    def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
         """Nominal and observed outputs of a chunk."""
+        if self.workers == 1:
+            return self._outputs_of(None, chunk)
+        # No process is started before commands and faults are found good.
+        key = (FunctionTwin, self.workers)  # processes can serve every function
+        with worker_processes(key, lambda: worker_pool(self.workers)) as pool:
+            return self._outputs_of(pool, chunk)
+
+    def _outputs_of(self, pool: ProcessPool | None, chunk: Chunk) -> tuple[NDArray, NDArray]:
         held = chunk.held_commands
         every = np.arange(len(held))
         # Without a nominal function, the healthy output of a trajectory is its nominal output.
@@ -171,7 +127,7 @@ class FunctionTwin:
         outputs = []
         for output in _outputs(calls, pool, chunk):
             outputs.append(output)
-            report(chunk, len(outputs) / len(calls))
+            chunk.report(len(outputs) / len(calls))
         nominal = np.concatenate(outputs[: len(clean)]).astype(chunk.commands.dtype)
         observed = nominal.copy()
         if len(faulty):
@@ -247,13 +203,11 @@ class _Call:
         bad = ~np.isfinite(outputs)
         if bad.any():
             row, sample, channel = np.argwhere(bad)[0]
-            raise InputError(
-                self.role,
-                expected=f"{_name(self.function)} to return finite numbers",
-                got=f"{outputs[row, sample, channel]} for {self.twin.outputs.names[channel]} in "
-                f"trajectory {self.ids[row]}, sample {sample}",
-                remedy="repair the function, or give limits that exclude such commands",
-            )
+            expected = f"{_name(self.function)} to return finite numbers"
+            got = f"{outputs[row, sample, channel]} for {self.twin.outputs.names[channel]} in "
+            got += f"trajectory {self.ids[row]}, sample {sample}"
+            remedy = "repair the function, or give limits that exclude such commands"
+            raise InputError(self.role, expected=expected, got=got, remedy=remedy)
 
 
 def _outputs(calls: Sequence[_Call], pool: ProcessPool | None, chunk: Chunk) -> Iterator[NDArray]:
@@ -267,12 +221,9 @@ def _outputs(calls: Sequence[_Call], pool: ProcessPool | None, chunk: Chunk) -> 
         try:
             yield future.result()
         except BrokenProcessPool as error:
-            raise InputError(
-                "workers",
-                expected="worker processes that can start",
-                got=str(error),
-                remedy="call it from a script, under `if __name__ == '__main__':`, or workers=1",
-            ) from error
+            expected = "worker processes that can start"
+            remedy = "call it from a script, under `if __name__ == '__main__':`, or workers=1"
+            raise InputError("workers", expected=expected, got=str(error), remedy=remedy) from error
         except ProcessExpired as error:
             chunk.failed[int(call.ids[0]) - chunk.index.start] = (
                 f"the process of {_name(call.function)} died, exit code {error.exitcode}"

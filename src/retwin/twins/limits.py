@@ -46,13 +46,10 @@ class Limits:
 
     def __post_init__(self) -> None:
         paired = len(self.low) == len(self.high)
-        require(
-            paired and all(a <= b for a, b in zip(self.low, self.high, strict=True)),
-            "limits",
-            expected="one low and one high per input channel, low at most high",
-            got=f"low {self.low}, high {self.high}",
-            remedy=UNLIMITED,
-        )
+        fits = paired and all(a <= b for a, b in zip(self.low, self.high, strict=True))
+        expected = "one low and one high per input channel, low at most high"
+        got = f"low {self.low}, high {self.high}"
+        require(fits, "limits", expected=expected, got=got, remedy=UNLIMITED)
         one_of("outside", self.outside, ("refuse", "clip"))
 
     def keep(self, commands: NDArray, inputs: Channels) -> NDArray:
@@ -86,12 +83,10 @@ class Limits:
             beyond = (commands[rows] < low) | (commands[rows] > high)
             if beyond.any():
                 trajectory, sample, channel = np.argwhere(beyond)[0] + (rows.start, 0, 0)
-                raise InputError(
-                    "commands",
-                    expected=f"{inputs.names[channel]} from {low[channel]:g} to {high[channel]:g} "
-                    f"{inputs.units[channel]}",
-                    got=f"{commands[trajectory, sample, channel]:g} in trajectory {trajectory}, "
-                    f"sample {sample}",
-                    remedy="keep the limits, or have commands clipped (outside='clip', or --clip)",
-                )
+                expected = f"{inputs.names[channel]} from {low[channel]:g} to {high[channel]:g} "
+                expected += f"{inputs.units[channel]}"
+                got = f"{commands[trajectory, sample, channel]:g} in trajectory {trajectory}, "
+                got += f"sample {sample}"
+                remedy = "keep the limits, or have commands clipped (outside='clip', or --clip)"
+                raise InputError("commands", expected=expected, got=got, remedy=remedy)
         return commands

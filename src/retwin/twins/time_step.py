@@ -40,14 +40,11 @@ def steps_per_sample(rate: float, step: float) -> int:
     positive("step", step, unit="s")
     ratio = 1.0 / rate / step
     count = round(ratio) if ratio < inf else 0
-    require(
-        count >= 1 and abs(count * step * rate - 1.0) <= TOLERANCE,
-        "step",
-        expected=f"a step that divides the sample period, {1.0 / rate:g} s",
-        got=f"{step:g} s",
-        remedy=f"give for instance step={1.0 / (rate * max(count, 1)):g}, or another sample rate "
-        f"(--rate), {1.0 / (step * max(count, 1)):g} Hz",
-    )
+    fits = count >= 1 and abs(count * step * rate - 1.0) <= TOLERANCE
+    expected = f"a step that divides the sample period, {1.0 / rate:g} s"
+    remedy = f"give for instance step={1.0 / (rate * max(count, 1)):g}, or another sample rate "
+    remedy += f"(--rate), {1.0 / (step * max(count, 1)):g} Hz"
+    require(fits, "step", expected=expected, got=f"{step:g} s", remedy=remedy)
     return count
 
 
@@ -65,11 +62,8 @@ class Timed:
     def check_steps(self) -> None:
         """Raise InputError for a rate without sense, and for too few samples or too many."""
         sample_rate("rate", self.rate)
-        require(
-            0 < self.duration < inf and self.steps >= 2,
-            "duration",
-            expected=f"at least two samples, {2 / self.rate:g} s",
-            got=f"{self.duration!r} s",
-            remedy="give the duration of a trajectory in seconds",
-        )
+        fits = 0 < self.duration < inf and self.steps >= 2
+        expected = f"at least two samples, {2 / self.rate:g} s"
+        remedy = "give the duration of a trajectory in seconds"
+        require(fits, "duration", expected=expected, got=f"{self.duration!r} s", remedy=remedy)
         Budget("duration").take(self.steps * np.dtype(float).itemsize)

@@ -27,6 +27,7 @@ from retwin.twins.faults.applied_faults import (
 )
 from retwin.twins.faults.system_faults import check_faults, measured_with
 from retwin.twins.limits import Limits
+from retwin.twins.workers import keep_workers
 from retwin.workers.threads import Turns, in_threads
 
 
@@ -113,13 +114,11 @@ def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
     """
     array = np.ascontiguousarray(commands)  # torch takes no negative strides
     shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] >= 2
-    require(
-        shaped and array.shape[2] == len(inputs) and array.dtype.kind in "fiu",
-        "commands",
-        expected=f"numbers of shape (n, T, {len(inputs)}), T at least 2",
-        got=f"{array.dtype} of shape {array.shape}",
-        remedy=f"give one column per input channel, {', '.join(inputs.names)}",
-    )
+    fits = shaped and array.shape[2] == len(inputs) and array.dtype.kind in "fiu"
+    expected = f"numbers of shape (n, T, {len(inputs)}), T at least 2"
+    got = f"{array.dtype} of shape {array.shape}"
+    remedy = f"give one column per input channel, {', '.join(inputs.names)}"
+    require(fits, "commands", expected=expected, got=got, remedy=remedy)
     check_finite("commands", array)
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
@@ -165,13 +164,10 @@ def checked_stride(
 def check_healthy(argument: str, trajectories: Trajectories) -> None:
     """Refuse a set without trajectories, or with one that is labelled with a fault."""
     faulty = int((~trajectories.maybe_healthy).sum())
-    require(
-        len(trajectories) > 0 and not faulty,
-        argument,
-        expected="healthy trajectories, one at least",
-        got=f"{len(trajectories)}, {faulty} of them with a fault",
-        remedy=f"take {argument}.with_label({HEALTHY!r})",
-    )
+    fits = len(trajectories) > 0 and not faulty
+    got = f"{len(trajectories)}, {faulty} of them with a fault"
+    remedy = f"take {argument}.with_label({HEALTHY!r})"
+    require(fits, argument, expected="healthy trajectories, one at least", got=got, remedy=remedy)
 
 
 def check_channels(twin: Twin, trajectories: Trajectories, argument: str) -> None:
@@ -275,6 +271,8 @@ class Chunk:
     turn : context manager
         A block that the simulations of all chunks enter in order, for what draws from a generator
         that they share, or changes other things in common.
+    report : callable
+        Takes the share of this chunk that is done, where a chunk takes long.
 
     """
 
@@ -289,6 +287,7 @@ class Chunk:
     failed: dict[int, str] = field(default_factory=dict)
     known: dict[int, int] = field(default_factory=dict)
     turn: AbstractContextManager[None] = field(default_factory=nullcontext)
+    report: Progress = lambda share: None
 
     @property
     def frozen(self) -> NDArray:
@@ -371,7 +370,14 @@ def simulate_in_chunks(
         effective = faulty_commands(clean, own, parts, rate=rate)
         values = {name: each[index] for name, each in (parameters or {}).items()}
         turn = turns.turn(begin // size)
-        chunk = Chunk(index, clean, effective, own, parts, rate, seed, values, turn=turn)
+
+        def report(share: float) -> None:
+            if progress is not None:
+                progress((begin + share * len(clean)) / len(commands))
+
+        chunk = Chunk(
+            index, clean, effective, own, parts, rate, seed, values, turn=turn, report=report
+        )
         try:
             nominal, healthy = run(chunk)
         finally:
@@ -389,7 +395,10 @@ def simulate_in_chunks(
 
 
 class ChunkedTwin:
-    """The base of twins that simulate some trajectories at a time, by their method `_run`."""
+    """The base of twins that simulate some trajectories at a time, by their method `_run`.
+
+    Worker processes that a chunk starts stay until all chunks are simulated.
+    """
 
     def simulate(
         self,
@@ -402,6 +411,7 @@ class ChunkedTwin:
         """See `Twin.simulate`."""
         twin: Any = self  # with the channels and the rate of the subclass
         run, emulated = twin._run, getattr(self, "emulated", False)
-        return simulate_in_chunks(
-            twin, run, commands, faults, seed=seed, progress=progress, emulated=emulated
-        )
+        with keep_workers():
+            return simulate_in_chunks(
+                twin, run, commands, faults, seed=seed, progress=progress, emulated=emulated
+            )

@@ -129,13 +129,10 @@ def _draws(updated: Twin, one: Trajectories, seed: int) -> Trajectories:
     remedy = "give the corrected twin that was fitted for these data"
     agree("updated", updated, one, "that of the trajectory", remedy=remedy)
     made = updated.simulate(np.repeat(one.commands, DRAWS, axis=0), seed=seed)
-    require(
-        bool(np.isfinite(made.observed).all()),
-        "updated",
-        expected="finite outputs for these commands",
-        got="outputs that are not",
-        remedy="fit it on commands like these",
-    )
+    fits = bool(np.isfinite(made.observed).all())
+    expected = "finite outputs for these commands"
+    got = "outputs that are not"
+    require(fits, "updated", expected=expected, got=got, remedy="fit it on commands like these")
     return made
 
 
@@ -159,13 +156,9 @@ def _check(fps: float, size: tuple[int, int], renderer: str, *, at_least: tuple[
     """Refuse settings out of range."""
     finite("fps", fps, at_least=1, at_most=100, unit="frames per second", remedy="25 is common")
     # Video codecs halve the resolution of colour.
-    require(
-        all(a <= side <= 4096 and side % 2 == 0 for a, side in zip(at_least, size, strict=True)),
-        "size",
-        expected=f"an even width and height from {at_least[0]}x{at_least[1]} to 4096x4096 pixels",
-        got=f"{size[0]}x{size[1]}",
-        remedy="640x480 is common",
-    )
+    fits = all(a <= side <= 4096 and side % 2 == 0 for a, side in zip(at_least, size, strict=True))
+    expected = f"an even width and height from {at_least[0]}x{at_least[1]} to 4096x4096 pixels"
+    require(fits, "size", expected=expected, got=f"{size[0]}x{size[1]}", remedy="640x480 is common")
     one_of("renderer", renderer, get_args(Renderer), remedy="leave it out to have one chosen")
 
 

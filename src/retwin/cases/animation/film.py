@@ -38,13 +38,10 @@ def check_film(path: str | os.PathLike[str]) -> str:
     """
     suffix = Path(path).suffix.lower()
     ends_in("path", path, (".mp4", ".gif"), remedy="choose one of these formats by the name")
-    require(
-        suffix == ".gif" or importlib.util.find_spec("imageio_ffmpeg") is not None,
-        "path",
-        expected="the package imageio-ffmpeg, which writes MP4",
-        got="an installation without it",
-        remedy=f"install it: {install_command('render')}, or write a *.gif",
-    )
+    fits = suffix == ".gif" or importlib.util.find_spec("imageio_ffmpeg") is not None
+    expected = "the package imageio-ffmpeg, which writes MP4"
+    remedy = f"install it: {install_command('render')}, or write a *.gif"
+    require(fits, "path", expected=expected, got="an installation without it", remedy=remedy)
     check_place(path)
     return suffix
 

@@ -154,12 +154,10 @@ class _Scene:
             self._model = _compile(stage)
             self._addresses = [self._model.joint(name).qposadr[0] for name in stage.joints]
         except (ValueError, KeyError) as error:
-            raise InputError(
-                "model",
-                expected=f"an MJCF file with the joints {', '.join(stage.joints)}",
-                got=f"{stage.model} ({brief(error)})",
-                remedy="make the body's model and its joints agree",
-            ) from None
+            expected = f"an MJCF file with the joints {', '.join(stage.joints)}"
+            got = f"{stage.model} ({brief(error)})"
+            remedy = "make the body's model and its joints agree"
+            raise InputError("model", expected=expected, got=got, remedy=remedy) from None
         self._data = mujoco.MjData(self._model)
         camera = stage.camera
         self._renderer = mujoco.Renderer(self._model, camera.size[1], camera.size[0])
@@ -174,22 +172,14 @@ class _Scene:
         self._ghost[0][own, :3] = GHOST
         mujoco.mj_forward(self._model, self._data)  # places the lights
 
-    def picture(
-        self, nominal: NDArray, observed: NDArray, *, ghost_opacity: float = 0.6
-    ) -> NDArray:
-        """The picture (height, width, 4) of nominal and observed joints in rad or m.
-
-        Parameters
-        ----------
-        ghost_opacity : float, default 0.6
-            Opacity of the ghost, from 0 to 1.
-
-        """
+    def picture(self, nominal: NDArray, observed: NDArray) -> NDArray:
+        """The picture (height, width, 4) of nominal and observed joints in rad or m."""
         # The ghost is behind the solid body: two surfaces in one place would flicker.
         ghost, solid = self._render(nominal, self._ghost), self._render(observed, self._solid)
         paper = np.round(255 * np.array(PAPER))
         behind, there = (np.abs(each - paper).max(axis=2) > 2 for each in (ghost, solid))
-        opacity = np.where(there, 1, ghost_opacity * behind)
+        # Opacity of the ghost, from 0 to 1.
+        opacity = np.where(there, 1, 0.6 * behind)
         colour = np.where(there[..., None], solid, ghost)
         return np.concatenate([colour, 255 * opacity[..., None]], axis=2).astype(np.uint8)
 

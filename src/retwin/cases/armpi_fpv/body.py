@@ -74,13 +74,9 @@ class ArmBody:
             ("commands", len(trajectories.inputs), self.twin.arm.joints),
             ("outputs", len(trajectories.outputs), 3),
         ):
-            require(
-                has == needs,
-                name,
-                expected=f"{needs} channels, those of the arm",
-                got=has,
-                remedy="load the file with the arm's case, which completes commands",
-            )
+            expected = f"{needs} channels, those of the arm"
+            remedy = "load the file with the arm's case, which completes commands"
+            require(has == needs, name, expected=expected, got=has, remedy=remedy)
         nominal = self.twin.angles(trajectories.commands.astype(float))
         return nominal, nearest_poses(self.twin.arm, nominal, _interpolate(trajectories))
 
@@ -106,9 +102,7 @@ class ArmBody:
         return np.stack(points, axis=-2)
 
 
-def nearest_poses(
-    arm: YawPitchArm, commanded: NDArray, tip: NDArray, *, switch_ratio: float = 0.5
-) -> NDArray:
+def nearest_poses(arm: YawPitchArm, commanded: NDArray, tip: NDArray) -> NDArray:
     """Poses that put the end-effector at given positions and are nearest to the commanded poses.
 
     Parameters
@@ -119,9 +113,6 @@ def nearest_poses(
         Commanded joint angles in rad.
     tip : ndarray, shape (n, T, 3)
         End-effector positions in m.
-    switch_ratio : float, default 0.5
-        Ratio of costs below which the pose found from the command replaces the one that continues
-        the motion. Without this margin the picture would flicker between two poses of similar cost.
 
     Returns
     -------
@@ -151,7 +142,10 @@ def nearest_poses(
         start = np.stack([before, commanded[:, t]])
         # Few steps suffice, since each sample starts at the pose of the sample before.
         found, cost = gauss_newton(partial(evaluate, t=t), start, rounds=8)
-        before = found[(cost[1] < switch_ratio * cost[0]).astype(int), chosen]
+        # Ratio of costs below which the pose found from the command replaces the one that continues
+        # the motion. Without this margin the picture would flicker between two poses of similar
+        # cost.
+        before = found[(cost[1] < 0.5 * cost[0]).astype(int), chosen]
         out[:, t] = before
     return out
 

@@ -11,13 +11,12 @@ FLOOR = 1e-13
 """Damping, relative to the trace of the normal matrix, below which it would be singular."""
 
 
+Evaluate = Callable[[NDArray], tuple[NDArray, NDArray]]
+"""From x (..., d) to the residuals (..., k) and their Jacobian (..., k, d)."""
+
+
 def gauss_newton(
-    evaluate: Callable[[NDArray], tuple[NDArray, NDArray]],
-    x: NDArray,
-    *,
-    rounds: int,
-    limit: float = np.inf,
-    damping: float = 1e-4,
+    evaluate: Evaluate, x: NDArray, *, rounds: int, limit: float = np.inf
 ) -> tuple[NDArray, NDArray]:
     """Minimise sums of squares from given starts.
 
@@ -32,9 +31,6 @@ def gauss_newton(
         is increased.
     limit : float, optional
         Largest absolute value of x.
-    damping : float, optional
-        Damping of the first step, relative to the trace of the normal matrix (Levenberg,
-        Marquardt).
 
     Returns
     -------
@@ -46,7 +42,8 @@ def gauss_newton(
     """
     error, slope = evaluate(x)
     cost = (error**2).sum(axis=-1)
-    ratio = np.full(cost.shape, damping)
+    # The damping of a step is relative to the trace of the normal matrix (Levenberg, Marquardt).
+    ratio = np.full(cost.shape, 1e-4)
     for _ in range(rounds):
         transposed = slope.swapaxes(-1, -2)
         matrix = transposed @ slope

@@ -237,17 +237,8 @@ class PathFit:
         fit = design @ (np.linalg.pinv(design) @ target)
         return ((target - fit) ** 2).mean(axis=(3, 4)) * STEP**2
 
-    def _set_yaw(
-        self, rows: NDArray, parts: NDArray, error: NDArray, *, regularisation: float = 1e-14
-    ) -> None:
-        """Ramps and rests of the yaw motor, by weighted least squares over each path.
-
-        Parameters
-        ----------
-        regularisation : float, default 1e-14
-            Weight in m^2 of a straight yaw: far less than that of a single sample off the axis.
-
-        """
+    def _set_yaw(self, rows: NDArray, parts: NDArray, error: NDArray) -> None:
+        """Ramps and rests of the yaw motor, by weighted least squares over each path."""
         parts, error, weight, angle = parts[rows], error[rows], self.weight[rows], self.angle[rows]
         length = np.argmin(error, axis=2)
         hats = _hats(np.take_along_axis(parts, length[..., None, None], axis=2)[:, :, 0])
@@ -260,7 +251,8 @@ class PathFit:
         matrix = transposed @ design
         vector = transposed @ (root * angle[..., None]).reshape(rows.size, -1, 1)
         # Where the data do not determine the yaw, the regularisation makes it straight.
-        inverse = np.linalg.inv(matrix + regularisation * np.eye(self.moves + 1))
+        # Weight in m^2 of a straight yaw: far less than that of a single sample off the axis.
+        inverse = np.linalg.inv(matrix + 1e-14 * np.eye(self.moves + 1))
         yaw = (inverse @ vector)[..., 0]
         if self.moves == 0:
             yaw[:, 0] = np.median(self.yaw[rows], axis=1) / STEP * self.determined[rows].any(axis=1)

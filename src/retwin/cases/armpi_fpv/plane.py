@@ -121,9 +121,7 @@ def bends(
     return low, bend(near)
 
 
-def grid_postures(
-    plane: Plane, paths: NDArray, rest: int, *, postures_per_rest: int = 24
-) -> tuple[NDArray, NDArray]:
+def grid_postures(plane: Plane, paths: NDArray, rest: int) -> tuple[NDArray, NDArray]:
     """Postures on whole steps within the tolerance of one rest of some paths.
 
     Parameters
@@ -134,15 +132,13 @@ def grid_postures(
         Index of those paths.
     rest : int
         Number of the rest, from 0.
-    postures_per_rest : int, default 24
-        Largest number of postures that are kept per rest; usually one or two are found.
 
     Returns
     -------
     path : ndarray of int, shape (c,)
         Path of each posture, ascending.
     posture : ndarray, shape (c, 3)
-        Postures in steps, at most `postures_per_rest` per path, the nearest ones first.
+        Postures in steps, at most 24 per path, the nearest ones first.
 
     """
     points, tolerance = plane.rests[paths, rest], plane.tolerance[paths]
@@ -166,5 +162,6 @@ def grid_postures(
     _, index = np.unique(keys, axis=0, return_index=True)
     index = index[np.lexsort((error[index], owner[index]))]
     rank = np.arange(index.size) - np.searchsorted(owner[index], owner[index])
-    index = index[rank < postures_per_rest]
+    # Largest number of postures that are kept per rest; usually one or two are found.
+    index = index[rank < 24]
     return paths[owner[index]], posture[index]

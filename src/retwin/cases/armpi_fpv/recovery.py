@@ -160,13 +160,9 @@ def _check(path: NDArray, arm: YawPitchArm) -> None:
         got=path.shape,
         remedy="pass one end-effector path per row, path[None] for a single one",
     )
-    require(
-        len(arm.links) == 3,
-        "arm",
-        expected="3 pitch joints",
-        got=len(arm.links),
-        remedy="pass the arm that made the path",
-    )
+    expected = "3 pitch joints"
+    remedy = "pass the arm that made the path"
+    require(len(arm.links) == 3, "arm", expected=expected, got=len(arm.links), remedy=remedy)
     check_finite("path", path)
 
 

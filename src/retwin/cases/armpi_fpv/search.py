@@ -122,9 +122,7 @@ def grid_chain(plane: Plane, paths: NDArray, *, grid_guesses: int = 24) -> Expla
     return _decide(plane, guesses)
 
 
-def free_chain(
-    plane: Plane, paths: NDArray, effort: int = 1, *, refined_guesses: int = 8
-) -> Explanations:
+def free_chain(plane: Plane, paths: NDArray, effort: int = 1) -> Explanations:
     """Find continuous postures, movement by movement and then for a whole path together.
 
     Parameters
@@ -135,8 +133,6 @@ def free_chain(
         Index of the paths that are explained.
     effort : int, default 1
         Factor of the number of starts and of the number of explanations that are kept.
-    refined_guesses : int, default 8
-        Number of explanations per path that are refined where none is good.
 
     Returns
     -------
@@ -160,7 +156,8 @@ def free_chain(
         again = guesses.rows(poor[guesses.path])
         every = np.ones((again.path.size, 27), dtype=bool)
         other = more.rows(poor[more.path]).join(_search(plane, move, again, every, effort, 40))
-        other = _best(plane, other, refined_guesses * effort, np.inf)
+        # Number of explanations per path that are refined where none is good.
+        other = _best(plane, other, 8 * effort, np.inf)
         _refine(plane, other, on_grid, move + 1, 12)
         # A rest that the arm cannot attain: the posture is kept and then refined.
         more = more.rows(~poor[more.path]).join(other)
@@ -200,23 +197,9 @@ def _decide(plane: Plane, found: Explanations) -> Explanations:
 
 
 def _search(
-    plane: Plane,
-    move: int,
-    guesses: Explanations,
-    fits: NDArray,
-    effort: int,
-    starts: int,
-    *,
-    starts_per_combination: int = 8,
+    plane: Plane, move: int, guesses: Explanations, fits: NDArray, effort: int, starts: int
 ) -> Explanations:
-    """Ramps among those that fit (g, 27), and next postures, for one movement of guesses.
-
-    Parameters
-    ----------
-    starts_per_combination : int, default 8
-        Number of local minima of the coarse scan from which each combination of ramps is fitted.
-
-    """
+    """Ramps among those that fit (g, 27), and next postures, for one movement of guesses."""
     scan, usable = _curve(plane, guesses.path, move + 1, DIRECTIONS * min(effort, 2))
     guess, combination = np.nonzero(fits & np.any(usable, axis=1, keepdims=True))
     old, lengths = guesses.postures[guess, move], COMBINATIONS[combination]
@@ -238,7 +221,8 @@ def _search(
     cost = cost.reshape(guess.size, 2, usable.shape[1] // 2)
     minimum = (cost <= np.roll(cost, 1, axis=2)) & (cost <= np.roll(cost, -1, axis=2))
     low = np.where(minimum, cost, np.inf).reshape(guess.size, usable.shape[1])
-    number = starts_per_combination * effort
+    # Number of local minima of the coarse scan from which each combination of ramps is fitted.
+    number = 8 * effort
     nth = np.argpartition(low, number, axis=1)[:, :number]
     which, rank = np.nonzero(np.isfinite(np.take_along_axis(low, nth, axis=1)))
     ends = postures(which, nth[which, rank])

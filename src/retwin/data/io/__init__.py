@@ -140,13 +140,10 @@ def _format(path: Path) -> FormatEntry:
     if (folder and (path / "metadata.yaml").is_file()) or (
         regular and not folder and path.suffix and path.suffix.lower() in LOGS
     ):
-        raise InputError(
-            "mapping",
-            expected=f"what the signals of {path.name}, a log, stand for",
-            got="none",
-            remedy=f"make one: retwin data map {path.name} --out mapping.toml; then give mapping "
-            "(--mapping)",
-        )
+        expected = f"what the signals of {path.name}, a log, stand for"
+        remedy = f"make one: retwin data map {path.name} --out mapping.toml; then give mapping "
+        remedy += "(--mapping)"
+        raise InputError("mapping", expected=expected, got="none", remedy=remedy)
     if folder:
         return FORMATS[".zarr" if (path / "zarr.json").exists() else ""]
     files, folders = (

@@ -148,13 +148,10 @@ def assemble(
     """
     first = raws[0]
     for raw in raws:
-        require(
-            (raw.commands is None) == (first.commands is None),
-            raw.where,
-            expected="commands in every trajectory or in none",
-            got="commands in some trajectories only",
-            remedy="split the data into two sets",
-        )
+        fits = (raw.commands is None) == (first.commands is None)
+        expected = "commands in every trajectory or in none"
+        got = "commands in some trajectories only"
+        require(fits, raw.where, expected=expected, got=got, remedy="split the data into two sets")
         for name, block in raw.blocks.items():
             _check_block(name, block, raw, first)
     steps = max(len(raw.nominal) for raw in raws)
@@ -187,22 +184,16 @@ def settle(
 
     """
     if rate is not None:
-        require(
-            _close(rate, trajectories.rate),
-            "rate",
-            expected=f"{trajectories.rate:g} Hz, the sample rate of the file",
-            got=f"{rate:g} Hz",
-            remedy="leave rate out",
-        )
+        expected = f"{trajectories.rate:g} Hz, the sample rate of the file"
+        got = f"{rate:g} Hz"
+        remedy = "leave rate out"
+        require(_close(rate, trajectories.rate), "rate", expected=expected, got=got, remedy=remedy)
     if case is None:
         return trajectories
-    require(
-        case.rate in (0, trajectories.rate),
-        "rate",
-        expected=f"{case.rate:g} Hz, the sample rate of the case",
-        got=f"{trajectories.rate:g} Hz",
-        remedy="resample the data, or leave the case out",
-    )
+    expected = f"{case.rate:g} Hz, the sample rate of the case"
+    got = f"{trajectories.rate:g} Hz"
+    remedy = "resample the data, or leave the case out"
+    require(case.rate in (0, trajectories.rate), "rate", expected=expected, got=got, remedy=remedy)
     width = trajectories.commands.shape[2]
     channels_of = [("outputs", "y", trajectories.outputs, case.outputs)]
     if width:
@@ -222,13 +213,10 @@ def settle(
             remedy="give the case that the data belong to",
         )
     unknown = sorted(trajectories.known_labels - set(case.classes))
-    require(
-        not unknown or not case.classes,
-        "labels",
-        expected=f"classes of the case, {', '.join(case.classes)}",
-        got=f"the unknown class {''.join(unknown[:1])!r}",
-        remedy="rename the class, or give the case that the data belong to",
-    )
+    expected = f"classes of the case, {', '.join(case.classes)}"
+    got = f"the unknown class {''.join(unknown[:1])!r}"
+    remedy = "rename the class, or give the case that the data belong to"
+    require(not unknown or not case.classes, "labels", expected=expected, got=got, remedy=remedy)
     settled = trajectories
     if case.classes:
         settled = trajectories.replace(
@@ -255,24 +243,19 @@ def _check_block(name: str, block: NDArray, raw: Raw, first: Raw) -> None:
     Outputs that were not measured may be NaN.
     """
     width = first.blocks[name].shape[1]
+    expected = f"{width} columns of {name}, as in {first.where}"
+    remedy = "keep data of different systems apart"
     require(
-        block.shape[1] == width,
-        raw.where,
-        expected=f"{width} columns of {name}, as in {first.where}",
-        got=block.shape[1],
-        remedy="keep data of different systems apart",
+        block.shape[1] == width, raw.where, expected=expected, got=block.shape[1], remedy=remedy
     )
     measured = name == "observed"
     bad = np.isinf(block) if measured else ~np.isfinite(block)
     if bad.any():
         sample, column = np.argwhere(bad)[0]
         repair = "replace infinite measurements by NaN"
-        raise InputError(
-            raw.where,
-            expected=f"finite values of {name}",
-            got=f"{block[sample, column]} in sample {sample}, column {column}",
-            remedy=repair if measured else "repair or drop that trajectory",
-        )
+        got = f"{block[sample, column]} in sample {sample}, column {column}"
+        remedy = repair if measured else "repair or drop that trajectory"
+        raise InputError(raw.where, expected=f"finite values of {name}", got=got, remedy=remedy)
 
 
 def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None) -> float:
@@ -280,22 +263,15 @@ def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None)
     found = [(rate, "the argument")] if rate is not None else []
     found += [(float(case.rate), "the case")] if case is not None and case.rate else []
     found += [(raw.rate, raw.where) for raw in raws if raw.rate is not None]
-    require(
-        found,
-        "rate",
-        expected="the sample rate, which the file does not hold",
-        got="none",
-        remedy="give rate (in Hz) or case; on the command line --rate or --case",
-    )
+    expected = "the sample rate, which the file does not hold"
+    remedy = "give rate (in Hz) or case; on the command line --rate or --case"
+    require(found, "rate", expected=expected, got="none", remedy=remedy)
     first, origin = found[0]
     for value, where in found[1:]:
-        require(
-            _close(value, first),
-            "rate",
-            expected=f"one sample rate, {first:g} Hz as in {origin}",
-            got=f"{value:g} Hz in {where}",
-            remedy="resample, or load the parts one by one",
-        )
+        expected = f"one sample rate, {first:g} Hz as in {origin}"
+        got = f"{value:g} Hz in {where}"
+        remedy = "resample, or load the parts one by one"
+        require(_close(value, first), "rate", expected=expected, got=got, remedy=remedy)
     return first if case is None else float(case.rate or first)
 
 

@@ -57,25 +57,18 @@ def read_class_folders(
     kinds: list[tuple[str, Reader]] = [("*.csv", _read_csv), ("dataset_*.mat", _read_dataset)]
     found = [(_in_order(path, pattern), read) for pattern, read in kinds]
     found = [(files, read) for files, read in found if files]
-    require(
-        len(found) == 1,
-        "path",
-        expected="a folder per class with *.csv or dataset_*.mat files",
-        got=f"{'both kinds' if found else 'no such file'} in {path}",
-        remedy="keep the kinds apart" if found else "give the folder above the class folders",
-    )
+    expected = "a folder per class with *.csv or dataset_*.mat files"
+    got = f"{'both kinds' if found else 'no such file'} in {path}"
+    remedy = "keep the kinds apart" if found else "give the folder above the class folders"
+    require(len(found) == 1, "path", expected=expected, got=got, remedy=remedy)
     files, read = found[0]
     raws, budget = [], Budget(path.name, max_bytes)
     with mat_reader() as reader:
         for file in tracked(files, len(files), progress):
             where = f"{file.parent.name}/{file.name}"
-            require(
-                file.is_file(),
-                where,
-                expected="a regular file",
-                got="a pipe, a device or a folder",
-                remedy="keep nothing else of that name there",
-            )
+            got = "a pipe, a device or a folder"
+            remedy = "keep nothing else of that name there"
+            require(file.is_file(), where, expected="a regular file", got=got, remedy=remedy)
             raws.append(read(file, where, case, budget, reader))
     raws, inputs = _commands_of_case(raws, case, radians=read is _read_dataset)
     source = Provenance(path.resolve().name, sha256(path))
@@ -116,13 +109,9 @@ def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget, _: 
             if len(fields) != width:
                 got = f"{len(fields)} columns in line {number} after {width} before"
                 break
-    require(
-        not got,
-        where,
-        expected="rows of numbers with commas between, all of one length, without a header",
-        got=got,
-        remedy="repair that line ('nan' stands for a missing measurement)",
-    )
+    expected = "rows of numbers with commas between, all of one length, without a header"
+    remedy = "repair that line ('nan' stands for a missing measurement)"
+    require(not got, where, expected=expected, got=got, remedy=remedy)
     block = np.frombuffer(values).reshape(-1, width)
     return Raw.of_columns(block, where, case, label, f"{label}/{file.stem}")
 
@@ -147,13 +136,10 @@ def _read_dataset(
             got=", ".join(sorted(mat_variables(file, budget, reader))) or "none",
             remedy="give the folder of the authors' data as it is",
         )
-    require(
-        len(nominal) == len(observed),
-        f"{where}: trajResps",
-        expected=f"{len(nominal)} samples, as trajCmds",
-        got=len(observed),
-        remedy="sample both on the same grid",
-    )
+    fits = len(nominal) == len(observed)
+    expected = f"{len(nominal)} samples, as trajCmds"
+    remedy = "sample both on the same grid"
+    require(fits, f"{where}: trajResps", expected=expected, got=len(observed), remedy=remedy)
     label = file.parent.name
     return Raw(where, label, nominal, observed, commands, f"{label}/{file.stem}", recorded)
 
@@ -161,13 +147,10 @@ def _read_dataset(
 def _upright(value: Any, width: int, where: str) -> NDArray:
     """`value` as (T, width), transposed if only its first axis has that width."""
     block = matrix(value, where)
-    require(
-        (block.shape[0] == width) != (block.shape[1] == width),
-        where,
-        expected=f"samples by {width} columns, or {width} rows by samples",
-        got=f"shape {block.shape}",
-        remedy="save samples by columns, with another number of samples than columns",
-    )
+    fits = (block.shape[0] == width) != (block.shape[1] == width)
+    expected = f"samples by {width} columns, or {width} rows by samples"
+    remedy = "save samples by columns, with another number of samples than columns"
+    require(fits, where, expected=expected, got=f"shape {block.shape}", remedy=remedy)
     return block if block.shape[1] == width else block.T
 
 
@@ -204,17 +187,8 @@ def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None,
     return np.stack(vectors, axis=1), next(iter(rates), None)
 
 
-def _series(
-    cell: Any, where: str, *, period_ratio: float = 1.5
-) -> tuple[NDArray | None, float | None]:
-    """Values (T,) and sample rate (Hz) of one motor; None for what cannot be decoded.
-
-    Parameters
-    ----------
-    period_ratio : float, default 1.5
-        The largest ratio of two sample periods that count as jitter: one sample less makes it 2.
-
-    """
+def _series(cell: Any, where: str) -> tuple[NDArray | None, float | None]:
+    """Values (T,) and sample rate (Hz) of one motor; None for what cannot be decoded."""
     if cell is None:
         return None, None
     data = _vector(cell.get("Data") if isinstance(cell, dict) else cell, where)
@@ -223,15 +197,13 @@ def _series(
     times = _vector(cell["Time"], where)
     periods = np.diff(times)
     growing = len(periods) and np.all(np.isfinite(periods) & (periods > 0))
+    expected = "one growing time per value"
+    got = f"{len(times)} times for {len(data)} values, or times that do not grow"
+    remedy = "repair the Time of the motor commands"
+    require(len(times) == len(data) and growing, where, expected=expected, got=got, remedy=remedy)
+    # The largest ratio of two sample periods that count as jitter: one sample less makes it 2.
     require(
-        len(times) == len(data) and growing,
-        where,
-        expected="one growing time per value",
-        got=f"{len(times)} times for {len(data)} values, or times that do not grow",
-        remedy="repair the Time of the motor commands",
-    )
-    require(
-        periods.max() <= period_ratio * periods.min(),
+        periods.max() <= 1.5 * periods.min(),
         where,
         expected="a constant sample rate",
         got=f"steps from {periods.min():g} to {periods.max():g} s",

@@ -99,20 +99,14 @@ def check_header(header: Any, where: str, newest: int = SCHEMA) -> None:
 
     """
     schema = header.get("schema") if isinstance(header, dict) else None
-    require(
-        isinstance(header, dict) and header.get("format") == FORMAT and type(schema) is int,
-        where,
-        expected="trajectories saved by retwin",
-        got="another kind of file",
-        remedy="give a file that `retwin data convert` wrote",
-    )
-    require(
-        isinstance(schema, int) and 1 <= schema <= newest,
-        where,
-        expected=f"schema {newest} or older",
-        got=f"schema {schema}",
-        remedy="upgrade retwin: pip install --upgrade retwin",
-    )
+    fits = isinstance(header, dict) and header.get("format") == FORMAT and type(schema) is int
+    expected = "trajectories saved by retwin"
+    remedy = "give a file that `retwin data convert` wrote"
+    require(fits, where, expected=expected, got="another kind of file", remedy=remedy)
+    fits = isinstance(schema, int) and 1 <= schema <= newest
+    expected = f"schema {newest} or older"
+    remedy = "upgrade retwin: pip install --upgrade retwin"
+    require(fits, where, expected=expected, got=f"schema {schema}", remedy=remedy)
 
 
 def restore(header: Mapping[str, Any], arrays: Mapping[str, NDArray], where: str) -> Trajectories:

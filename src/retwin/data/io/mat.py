@@ -46,14 +46,11 @@ def read_mat(
     with mat_reader() as reader:
         variables = mat_variables(path, budget, reader)
     found = [pair for pair in PAIRS if set(pair) <= set(variables)]
-    require(
-        len(found) == 1,
-        path.name,
-        expected=" or ".join(f"{x} with {y}" for x, y in PAIRS) + ", one pair of them",
-        got=f"the variables {', '.join(sorted(variables)) or 'none'}",
-        remedy="save trajectories and class names under these names; for dataset_*.mat files "
-        "give the folder that holds one folder per class",
-    )
+    expected = " or ".join(f"{x} with {y}" for x, y in PAIRS) + ", one pair of them"
+    got = f"the variables {', '.join(sorted(variables)) or 'none'}"
+    remedy = "save trajectories and class names under these names; for dataset_*.mat files "
+    remedy += "give the folder that holds one folder per class"
+    require(len(found) == 1, path.name, expected=expected, got=got, remedy=remedy)
     (x_name, y_name) = found[0]
     blocks = _cells(variables[x_name], f"{path.name}: {x_name}")
     labels = _cells(variables[y_name], f"{path.name}: {y_name}")
@@ -110,12 +107,10 @@ def send_variables(request: dict[str, Any]) -> Iterator[Frame]:
     try:
         found = loadmat(path, variable_names=request["names"])
     except NotImplementedError:  # scipy's error for HDF5
-        raise InputError(
-            path.name,
-            expected="a MAT file of version 5 to 7",
-            got="one of version 7.3 (HDF5) or newer",
-            remedy="save it in MATLAB with the option '-v7'",
-        ) from None
+        expected = "a MAT file of version 5 to 7"
+        got = "one of version 7.3 (HDF5) or newer"
+        remedy = "save it in MATLAB with the option '-v7'"
+        raise InputError(path.name, expected=expected, got=got, remedy=remedy) from None
     for name, value in found.items():
         if not name.startswith("__"):
             arrays: list[NDArray] = []
@@ -167,13 +162,11 @@ def matrix(value: Any, where: str) -> NDArray:
 
     """
     block = np.asarray(value)
-    require(
-        block.dtype.kind in "iuf" and block.ndim == 2 and block.size,
-        where,
-        expected="a table of real numbers, samples by columns",
-        got=f"{block.dtype} of shape {block.shape}",
-        remedy="save the numbers as a two-dimensional array",
-    )
+    fits = block.dtype.kind in "iuf" and block.ndim == 2 and block.size
+    expected = "a table of real numbers, samples by columns"
+    got = f"{block.dtype} of shape {block.shape}"
+    remedy = "save the numbers as a two-dimensional array"
+    require(fits, where, expected=expected, got=got, remedy=remedy)
     if block.dtype.kind != "f":
         return block.astype(np.float64)
     return block.astype(block.dtype.newbyteorder("="), copy=False)
@@ -181,24 +174,17 @@ def matrix(value: Any, where: str) -> NDArray:
 
 def _cells(value: Any, where: str) -> list[Any]:
     cells = np.asarray(value)
-    require(
-        cells.dtype == object and cells.size in (0, max(cells.shape, default=0)),
-        where,
-        expected="a row of cells, one per trajectory",
-        got=f"{cells.dtype} of shape {cells.shape}",
-        remedy="save a cell array of size 1 by n",
-    )
+    fits = cells.dtype == object and cells.size in (0, max(cells.shape, default=0))
+    expected = "a row of cells, one per trajectory"
+    got = f"{cells.dtype} of shape {cells.shape}"
+    require(fits, where, expected=expected, got=got, remedy="save a cell array of size 1 by n")
     return list(cells.ravel())
 
 
 def _text(value: Any, where: str) -> str:
     name = np.asarray(value)
     # An empty text has no element: a trajectory without a label.
-    require(
-        name.dtype.kind == "U" and name.size <= 1,
-        where,
-        expected="a class name",
-        got=f"{name.dtype} of shape {name.shape}",
-        remedy="save class names as texts",
-    )
+    fits = name.dtype.kind == "U" and name.size <= 1
+    got = f"{name.dtype} of shape {name.shape}"
+    require(fits, where, expected="a class name", got=got, remedy="save class names as texts")
     return str(name.item()) if name.size else ""

@@ -82,12 +82,10 @@ class Scratch:
             while rest:
                 rest = rest[self._file.write(rest) :]
         except OSError as error:
-            raise InputError(
-                "TMPDIR",
-                expected="a folder for temporary files with room for all numbers of the set",
-                got=f"{tempfile.gettempdir()} ({error.strerror or error})",
-                remedy="set TMPDIR to a folder on a larger disk, or read a part of the set",
-            ) from error
+            expected = "a folder for temporary files with room for all numbers of the set"
+            got = f"{tempfile.gettempdir()} ({error.strerror or error})"
+            remedy = "set TMPDIR to a folder on a larger disk, or read a part of the set"
+            raise InputError("TMPDIR", expected=expected, got=got, remedy=remedy) from error
         self._count += len(rows)
 
     def array(self) -> NDArray:
@@ -196,17 +194,10 @@ def _open(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
         yield group, dict(header)
 
 
-def create_chunked(
-    path: Path, header: Mapping[str, Any], dtype: DTypeLike, *, level: int = 1
-) -> None:
+def create_chunked(path: Path, header: Mapping[str, Any], dtype: DTypeLike) -> None:
     """Make the arrays of `chunked_header` in the new folder `path`, still without any values.
 
     Numbers are stored as `dtype`.
-
-    Parameters
-    ----------
-    level : int, default 1
-        Level of the compression of chunks: half the time of the default, for a file 1 % larger.
 
     Raises
     ------
@@ -221,7 +212,8 @@ def create_chunked(
         shape = header["arrays"][name]["shape"]
         chunks = (header["chunk"], *(max(1, size) for size in shape[1:]))
         kind = kinds.get(name, np.dtype(dtype)).newbyteorder("<")
-        codec = zarr.codecs.ZstdCodec(level=level)
+        # Level of the compression of chunks: half the time of the default, for a file 1 % larger.
+        codec = zarr.codecs.ZstdCodec(level=1)
         group.create_array(name, shape=shape, dtype=kind, chunks=chunks, compressors=codec)
 
 
@@ -259,27 +251,15 @@ def _copy(stored: Any) -> NDArray:
 
 
 def _read_chunks(
-    group: Any,
-    header: Mapping[str, Any],
-    where: str,
-    rows: slice,
-    budget: Budget,
-    *,
-    bytes_per_trajectory: int = 32,
+    group: Any, header: Mapping[str, Any], where: str, rows: slice, budget: Budget
 ) -> Trajectories:
-    """The trajectories at `rows` that did not fail; one chunk at a time is in memory.
-
-    Parameters
-    ----------
-    bytes_per_trajectory : int, default 32
-        Memory for the place of a trajectory in a set of which a part is read.
-
-    """
+    """The trajectories at `rows` that did not fail; one chunk at a time is in memory."""
     size = int(header["chunk"])
     for name in CHUNKED_NAMES:
         _check_size(group[name], header["arrays"][name]["shape"], size, where)
     count = group["labels"].shape[0]
-    Budget(where).take(bytes_per_trajectory * count)
+    # Memory for the place of a trajectory in a set of which a part is read.
+    Budget(where).take(32 * count)
     index = np.arange(count)[rows]
     for name in CHUNKED_NAMES:
         budget.take(len(index) * group[name].nbytes // max(1, count))
@@ -322,13 +302,9 @@ def _check_size(array: Any, shape: list[int], chunk: int, where: str, *, copies:
     )
     # Other codecs may unpack a small file to any size.
     codecs = [type(codec).__name__ for codec in array.metadata.codecs]
-    require(
-        codecs == CODECS,
-        where,
-        expected=f"numbers that are packed by {' and '.join(CODECS)}",
-        got=", ".join(codecs),
-        remedy="the folder is damaged: get or make it again",
-    )
+    expected = f"numbers that are packed by {' and '.join(CODECS)}"
+    remedy = "the folder is damaged: get or make it again"
+    require(codecs == CODECS, where, expected=expected, got=", ".join(codecs), remedy=remedy)
     Budget(where).take(copies * math.prod(chunks) * array.dtype.itemsize)
 
 

@@ -192,13 +192,10 @@ def mean_of(found: Sequence[Signal], place: str) -> Signal:
     """The mean of signals with the same times and unit, which is missing where one is."""
     first = found[0]
     for other in found[1:]:
-        require(
-            np.array_equal(first.times, other.times) and same_unit(first.unit, other.unit),
-            f"{place}, {other.name}",
-            expected=f"the times and the unit of {first.name!r}, with which it is averaged",
-            got="others",
-            remedy="map one of them alone",
-        )
+        fits = np.array_equal(first.times, other.times) and same_unit(first.unit, other.unit)
+        expected = f"the times and the unit of {first.name!r}, with which it is averaged"
+        remedy = "map one of them alone"
+        require(fits, f"{place}, {other.name}", expected=expected, got="others", remedy=remedy)
     return replace(
         first,
         name=", ".join(each.name for each in found),
@@ -250,14 +247,10 @@ def in_order(signal: Signal, where: str, *, disorder: float = 10.0) -> tuple[Sig
         return replace(signal, times=times, values=values), []
     place, typical = f"{where}, {signal.name}", float(np.median(np.abs(steps)))
     same = int((steps == 0).sum())
-    require(
-        typical > 0,
-        place,
-        expected="values at times of their own",
-        got=f"{same} of {len(times)} at the time of the one before",
-        remedy="name a column of finer times in [time] of a mapping, or give rate = … in its "
-        "place for even rows",
-    )
+    got = f"{same} of {len(times)} at the time of the one before"
+    remedy = "name a column of finer times in [time] of a mapping, or give rate = … in its "
+    remedy += "place for even rows"
+    require(typical > 0, place, expected="values at times of their own", got=got, remedy=remedy)
     worst = int(np.argmin(steps))
     even = np.mean(np.abs(np.delete(steps, worst) - typical) <= EVEN * typical) > 1 - EVEN
     repeated = abs(HOUR + steps[worst] - typical) <= EVEN * typical and even
@@ -268,14 +261,11 @@ def in_order(signal: Signal, where: str, *, disorder: float = 10.0) -> tuple[Sig
         got=f"one hour twice, at {times[worst]:g} s, as at the end of summer time",
         remedy="record UTC, or add its offset to each time (+02:00), or split the log there",
     )
-    require(
-        -steps[worst] <= disorder * typical,
-        place,
-        expected="times that increase",
-        got=f"a step back of {-steps[worst]:g} s at {times[worst]:g} s",
-        remedy="split the log there, or give other times in [time] of a mapping: rate = … in "
-        'place of column for even rows, stamps = "log" for messages',
-    )
+    expected = "times that increase"
+    got = f"a step back of {-steps[worst]:g} s at {times[worst]:g} s"
+    remedy = "split the log there, or give other times in [time] of a mapping: rate = … in "
+    remedy += 'place of column for even rows, stamps = "log" for messages'
+    require(-steps[worst] <= disorder * typical, place, expected=expected, got=got, remedy=remedy)
     early = np.maximum.accumulate(times) - times
     order = np.argsort(times, kind="stable")
     times, values = times[order], values[order]

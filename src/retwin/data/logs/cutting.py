@@ -81,13 +81,9 @@ def pieces(
             Piece(only.start + k * cut.length, only.start + (k + 1) * cut.length, True)
             for k in range(count)
         ]
-        require(
-            found,
-            "cut.length",
-            expected=f"a length within the log, {only.stop - only.start:g} s",
-            got=f"{cut.length:g} s",
-            remedy="give a shorter one",
-        )
+        expected = f"a length within the log, {only.stop - only.start:g} s"
+        got = f"{cut.length:g} s"
+        require(found, "cut.length", expected=expected, got=got, remedy="give a shorter one")
     return found
 
 
@@ -114,12 +110,10 @@ def _cut_at_triggers(cut: Cut, trigger: Signal, end: float) -> list[Piece]:
     crossings = at[1:][above[1:] & ~above[:-1]]
     if not len(crossings):
         low, high = (float(values.min()), float(values.max())) if len(values) else (np.nan, np.nan)
-        raise InputError(
-            "cut.level",
-            expected=f"a level that {trigger.name!r} crosses, {cut.edge}",
-            got=f"{cut.level:g}, while its values are from {low:g} to {high:g}",
-            remedy="give another level, edge or signal",
-        )
+        expected = f"a level that {trigger.name!r} crosses, {cut.edge}"
+        got = f"{cut.level:g}, while its values are from {low:g} to {high:g}"
+        remedy = "give another level, edge or signal"
+        raise InputError("cut.level", expected=expected, got=got, remedy=remedy)
     starts = crossings - cut.before
     nexts = np.append(starts[1:], np.inf)
     # No sample is in two trajectories, of which one might calibrate and the other one test.

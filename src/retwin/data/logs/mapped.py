@@ -18,7 +18,7 @@ from retwin.data.logs.channels import Channel, channels_of, in_order, signal_of,
 from retwin.data.logs.cutting import Piece, pieces
 from retwin.data.logs.mapping import NO_NOMINAL, Mapping, read_mapping
 from retwin.data.logs.reading import read_log
-from retwin.data.logs.signals import NANOSECONDS, Log, Signal
+from retwin.data.logs.signals import NANOSECONDS, Log
 from retwin.data.provenance import Provenance
 from retwin.data.resampling import SAME
 from retwin.data.row_times import misread_unit
@@ -129,9 +129,9 @@ def parts_of(
     trigger = None
     if mapping.cut.by == "trigger" and mapping.cut.signal:
         trigger = in_order(signal_of(log, mapping.cut.signal), log.name)[0]
-    every = [each.signal for each in (*commands, *measured, *ideal)]
+    every = [each.signal for each in found.every]
     parts = pieces(mapping.cut, every, [each.signal for each in commands], trigger)
-    _check_dense(log, parts, rate, max(every, key=lambda each: len(each.times)), budget, len(every))
+    _check_dense(log, found, parts, budget)
     shortest = max(2, round((mapping.cut.min_length or 0.0) * rate))
     for piece in parts:
         found.add(piece, shortest)
@@ -279,29 +279,15 @@ def _rate(mapping: Mapping, case: DataCase | None, rate: float | None) -> float:
     return float(given("mapping: rate", found, expected, remedy=remedy))
 
 
-def _check_dense(
-    log: Log,
-    parts: Sequence[Piece],
-    rate: float,
-    densest: Signal,
-    budget: Budget,
-    width: int,
-    *,
-    sparse: float = 100.0,
-) -> None:
-    """Refuse times in another unit, and times between which there are many more samples.
-
-    Parameters
-    ----------
-    sparse : float, default 100.0
-        Samples per value of a log from which its times, or the sample rate, are wrong.
-
-    """
+def _check_dense(log: Log, found: Parts, parts: Sequence[Piece], budget: Budget) -> None:
+    """Refuse times in another unit, and times between which there are many more samples."""
+    rate = found.rate
     samples = sum(each.stop - each.start for each in parts) * rate
-    values, span = len(densest.times), samples / rate
+    values, span = max(len(each.signal.times) for each in found.every), samples / rate
     remedy = 'check rate, and column and unit of [time], in the mapping; by = "gap" in [cut] '
     remedy += "leaves out pauses"
-    got, wrong = f"{values} values in {span:g} s", samples > sparse * max(values, 2)
+    # From 100 samples per value on, the times of the log or the sample rate are wrong.
+    got, wrong = f"{values} values in {span:g} s", samples > 100 * max(values, 2)
     unit = misread_unit(span / max(values - 1, 1), 1 / rate) if wrong or samples < 1 else ""
     if unit:
         got += f", as if times in {unit} were read as s"
@@ -310,4 +296,4 @@ def _check_dense(
             remedy = "write the times in s, or as dates with hours, minutes and seconds"
     expected = f"values about {1 / rate:g} s apart, the sample period"
     require(not (wrong or unit), log.name, expected=expected, got=got, remedy=remedy)
-    budget.take(int(samples) * width * 8)
+    budget.take(int(samples) * len(found.every) * 8)

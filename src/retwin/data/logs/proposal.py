@@ -131,22 +131,10 @@ def propose_mapping(
 
 
 def _read_stamped(
-    path: Path,
-    proposal: Proposal,
-    names: Collection[str],
-    stamped: TimeSettings,
-    budget: Budget,
-    *,
-    max_stamp_age: float = 60.0,
+    path: Path, proposal: Proposal, names: Collection[str], stamped: TimeSettings, budget: Budget
 ) -> tuple[Log, float] | None:
     """Signals at the stamps of their headers, and the median time in s from there
     to the recording; None if the stamps are of no use.
-
-    Parameters
-    ----------
-    max_stamp_age : float, default 60.0
-        Median time in s from stamp to recording at which the stamps are those of another clock.
-
     """
     try:
         other = read_log(path, wanted=names, clock=stamped.clock, budget=budget)
@@ -165,7 +153,7 @@ def _read_stamped(
         if not any(one.name.startswith(topic) for topic in unstamped)
     ]
     found = float(np.median(np.concatenate(delays))) if delays else -1.0
-    return (other, found) if 0 <= found < max_stamp_age else None
+    return (other, found) if 0 <= found < 60.0 else None  # s; else those of another clock
 
 
 def _fact(signal: Signal) -> Fact:
@@ -211,12 +199,9 @@ def proposed(
         for each in facts:
             if not each.constant:
                 in_order(log.signals[each.name], log.name)  # its times repeat: says so
-        raise InputError(
-            log.name,
-            expected="signals that change",
-            got=f"{len(facts)} that are constant or have one value",
-            remedy="check that it is the right log",
-        )
+        got = f"{len(facts)} that are constant or have one value"
+        remedy = "check that it is the right log"
+        raise InputError(log.name, expected="signals that change", got=got, remedy=remedy)
     chosen = _by_name(moving) if case is None else _for_case(moving, case)
     by_unit = _add_by_unit(chosen, moving, units_of(case))
     used = [fact for table in chosen.values() for fact in table.values() if fact is not None]

@@ -128,13 +128,10 @@ def _files(path: Path) -> list[Path]:
     """The files of a log, each of which must be a regular file in its folder."""
     files = [each for each in path.iterdir() if not each.is_dir()] if path.is_dir() else [path]
     for each in files:
-        require(
-            each.is_file() and (each == path or not each.is_symlink()),
-            str(each),
-            expected="a regular file",
-            got="a link, a pipe or a device",
-            remedy="keep nothing but the files of the bag in its folder",
-        )
+        fits = each.is_file() and (each == path or not each.is_symlink())
+        expected = "a regular file"
+        remedy = "keep nothing but the files of the bag in its folder"
+        require(fits, str(each), expected=expected, got="a link, a pipe or a device", remedy=remedy)
     return files
 
 

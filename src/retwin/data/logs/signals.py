@@ -189,12 +189,10 @@ def to_nanoseconds(times: NDArray, unit: str, where: str) -> NDArray:
     fine = np.abs(scaled) < LATEST  # NaN is not
     if not fine.all():
         row = int(np.argmin(fine))
-        raise InputError(
-            where,
-            expected="a time in every row, before the year 2262",
-            got=f"{times[row]} {unit} in row {row}",
-            remedy="remove that row, or check column and unit of [time] in the mapping",
-        )
+        expected = "a time in every row, before the year 2262"
+        got = f"{times[row]} {unit} in row {row}"
+        remedy = "remove that row, or check column and unit of [time] in the mapping"
+        raise InputError(where, expected=expected, got=got, remedy=remedy)
     if times.dtype.kind == "O":
         return np.array([round(each * NANOSECONDS[unit]) for each in times], np.int64)
     return scaled.astype(np.int64)

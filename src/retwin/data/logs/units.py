@@ -125,12 +125,9 @@ def converted(values: NDArray, source: str, target: str, where: str) -> NDArray:
     except InputError:
         raise
     except Exception as error:
-        raise InputError(
-            where,
-            expected=f"a unit that is converted to {target!r}",
-            got=f"{source!r} ({type(error).__name__}: {brief(error)})",
-            remedy=remedy,
-        ) from None
+        expected = f"a unit that is converted to {target!r}"
+        got = f"{source!r} ({type(error).__name__}: {brief(error)})"
+        raise InputError(where, expected=expected, got=got, remedy=remedy) from None
     offset, slope = float(ends[0]), float(ends[1] - ends[0])
     # Every unit of pint that is no logarithm is a line; the others are refused.
     line = np.isclose(ends[2], offset + 2 * slope, rtol=1e-9, atol=1e-300)

@@ -125,14 +125,9 @@ def _check_outputs(twin: CorrectedTwin) -> None:
 
 
 def _refuse(wrong: bool, got: str, remedy: str) -> None:
-    require(
-        not wrong,
-        "twin",
-        expected="a corrected twin whose correction is what its actuators execute, by past "
-        "commands alone",
-        got=got,
-        remedy=remedy,
-    )
+    expected = "a corrected twin whose correction is what its actuators execute, by past "
+    expected += "commands alone"
+    require(not wrong, "twin", expected=expected, got=got, remedy=remedy)
 
 
 @torch.no_grad()
@@ -149,13 +144,10 @@ def drawn(
     assert isinstance(residual, ResidualModel)
     context = residual.context(twin.surrogate, commands)
     valid = torch.as_tensor(context.segments.valid)
-    require(
-        bool(valid.any()),
-        "commands",
-        expected="commands that move and rest, as in calibration",
-        got="none that changes",
-        remedy="give commands of the task, or leave them out for the case's",
-    )
+    expected = "commands that move and rest, as in calibration"
+    got = "none that changes"
+    remedy = "give commands of the task, or leave them out for the case's"
+    require(bool(valid.any()), "commands", expected=expected, got=got, remedy=remedy)
     distribution = residual(context)
     mean = residual.mean(context)[valid]
     generator = torch.Generator().manual_seed(seed)

@@ -209,20 +209,11 @@ def fit_guard(
     """
     healthy = calibration.with_label(HEALTHY) if calibration.known_labels else calibration
     per_class = count // len(case.classes)
-    require(
-        len(healthy) > 0,
-        "calibration",
-        expected="at least one healthy trajectory",
-        got="none",
-        remedy="calibrate on some healthy trajectories",
-    )
-    require(
-        per_class >= 5,
-        "count",
-        expected=f"at least five generated ones per class, {5 * len(case.classes)}",
-        got=count,
-        remedy="generate more",
-    )
+    expected = "at least one healthy trajectory"
+    remedy = "calibrate on some healthy trajectories"
+    require(len(healthy) > 0, "calibration", expected=expected, got="none", remedy=remedy)
+    expected = f"at least five generated ones per class, {5 * len(case.classes)}"
+    require(per_class >= 5, "count", expected=expected, got=count, remedy="generate more")
     made = generate(twin, case, per_class=per_class, seed=seed)
     training_part, held_out = made.split(0.8, seed=seed)
     features = Features.at(made, min(case.sensor_rate, made.rate))

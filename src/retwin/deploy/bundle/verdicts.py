@@ -169,13 +169,10 @@ class Domain:
 
     def __post_init__(self) -> None:
         counts = [[len(getattr(self, name)) for name in names] for names in (COMMANDS, OUTPUTS)]
-        require(
-            all(len(set(each)) == 1 for each in counts),
-            "domain",
-            expected="one number per channel in every range",
-            got=counts,
-            remedy="make the bundle and its export anew",
-        )
+        fits = all(len(set(each)) == 1 for each in counts)
+        expected = "one number per channel in every range"
+        remedy = "make the bundle and its export anew"
+        require(fits, "domain", expected=expected, got=counts, remedy=remedy)
         with np.errstate(over="ignore", invalid="ignore"):
             widths = [np.subtract(self.high, self.low), np.subtract(self.ceiling, self.floor)]
         numbers = [getattr(self, each.name) for each in fields(self)]
@@ -253,13 +250,10 @@ class Domain:
             got=trajectories.commands.shape[2],
             remedy="read the file with its case, which recovers commands",
         )
-        require(
-            trajectories.nominal.shape[2] == len(self.floor),
-            "domain",
-            expected=f"ranges of {trajectories.nominal.shape[2]} outputs",
-            got=f"those of {len(self.floor)}",
-            remedy="make the bundle and its export anew",
-        )
+        fits = trajectories.nominal.shape[2] == len(self.floor)
+        expected = f"ranges of {trajectories.nominal.shape[2]} outputs"
+        remedy = "make the bundle and its export anew"
+        require(fits, "domain", expected=expected, got=f"those of {len(self.floor)}", remedy=remedy)
 
         def nominal(some: Trajectories) -> NDArray:
             return mismatch(some) / self.mismatch

@@ -149,12 +149,9 @@ def _text(twin: object, commands: NDArray | None) -> Text:
         return states_text(twin)  # type: ignore[arg-type]
     if isinstance(twin, Surrogate | CorrectedTwin):
         return surrogate_text(twin, commands)
-    raise InputError(
-        "twin",
-        expected="a twin with state equations, corrected dynamics, or a surrogate",
-        got=type(twin).__name__,
-        remedy="learn state equations for it: fit_state_surrogate",
-    )
+    expected = "a twin with state equations, corrected dynamics, or a surrogate"
+    remedy = "learn state equations for it: fit_state_surrogate"
+    raise InputError("twin", expected=expected, got=type(twin).__name__, remedy=remedy)
 
 
 def _add_binary(content: dict[str, bytes], version: str, identifier: str) -> None:

@@ -68,12 +68,9 @@ def c_network(config: Network, inputs: int, outputs: int) -> CNetwork:
         case StateSpace(states, hidden):
             sizes = f"{inputs}, {states}, {hidden}, {outputs}"
             return CNetwork("state_space", sizes, states, max(states + hidden, outputs))
-    raise InputError(
-        "model",
-        expected="networks that exist in C: MLP, LSTM, TCN and StateSpace",
-        got=repr(config),
-        remedy="fit it with one of these",
-    )
+    expected = "networks that exist in C: MLP, LSTM, TCN and StateSpace"
+    remedy = "fit it with one of these"
+    raise InputError("model", expected=expected, got=repr(config), remedy=remedy)
 
 
 def weights_of(config: Network, module: Any) -> NDArray:

@@ -36,13 +36,10 @@ def states_text(twin: StateTwin | DynamicsTwin | CorrectedTwin) -> Text:
     ranged = isinstance(twin, DynamicsTwin)
     corrected = twin if isinstance(twin, DynamicsTwin) else _convert(twin)
     interpolation = corrected.equations.interpolation
-    require(
-        interpolation != "spline",
-        "twin",
-        expected="commands that are held or straight lines between samples",
-        got="splines, which depend on commands that an FMU does not know yet",
-        remedy='make the twin with interpolation="linear"',
-    )
+    expected = "commands that are held or straight lines between samples"
+    got = "splines, which depend on commands that an FMU does not know yet"
+    remedy = 'make the twin with interpolation="linear"'
+    require(interpolation != "spline", "twin", expected=expected, got=got, remedy=remedy)
     variables, places = _variables(corrected, ranged)
     steps = c_source(__package__, "variables.c", "random.c", "states.c")
     return Text(

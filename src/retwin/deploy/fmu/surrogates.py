@@ -107,13 +107,8 @@ def _commands(
 
 
 def _refuse(wrong: bool, got: str, remedy: str) -> None:
-    require(
-        not wrong,
-        "twin",
-        expected="a twin whose outputs depend on past commands alone, in parts that exist in C",
-        got=got,
-        remedy=remedy,
-    )
+    expected = "a twin whose outputs depend on past commands alone, in parts that exist in C"
+    require(not wrong, "twin", expected=expected, got=got, remedy=remedy)
 
 
 def _per_sample(residual: Residual, rate: float) -> SequenceResidual:

@@ -142,13 +142,9 @@ def _check_exportable(bundle: Bundle) -> None:
         ),
     )
     for exportable, part in parts:
-        require(
-            exportable,
-            "bundle",
-            expected="parts that have an ONNX graph",
-            got=f"a {part}",
-            remedy="use the bundle with torch, or fit that part anew as another kind",
-        )
+        expected = "parts that have an ONNX graph"
+        remedy = "use the bundle with torch, or fit that part anew as another kind"
+        require(exportable, "bundle", expected=expected, got=f"a {part}", remedy=remedy)
 
 
 def _graphs(bundle: Bundle) -> dict[str, Graph]:

@@ -317,13 +317,11 @@ class Portable:
     def _check_size(self, steps: int, segments: int) -> None:
         """Raise InputError for another length or more segments than the graphs have."""
         facts = self.facts
-        require(
-            steps == facts.steps and segments <= facts.max_segments,
-            "trajectories",
-            expected=f"{facts.steps} samples and at most {facts.max_segments} segments",
-            got=f"{steps} samples, {segments} segments",
-            remedy="cut them, or use the bundle with torch, which takes any length",
-        )
+        fits = steps == facts.steps and segments <= facts.max_segments
+        expected = f"{facts.steps} samples and at most {facts.max_segments} segments"
+        got = f"{steps} samples, {segments} segments"
+        remedy = "cut them, or use the bundle with torch, which takes any length"
+        require(fits, "trajectories", expected=expected, got=got, remedy=remedy)
 
 
 def _outputs(trajectories: Trajectories) -> dict[str, NDArray]:

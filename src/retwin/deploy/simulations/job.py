@@ -120,13 +120,10 @@ def simulate_to(
     if check_target(target) == ".npz":
         _check_small(plan, workers, scheduler)
         return _into_npz(target, plan, report)
-    require(
-        workers is None or (workers >= 1 and scheduler is None),
-        "workers",
-        expected="at least 1, or None with a scheduler, which has its own",
-        got=f"{workers}, scheduler {scheduler}",
-        remedy="leave workers out",
-    )
+    fits = workers is None or (workers >= 1 and scheduler is None)
+    expected = "at least 1, or None with a scheduler, which has its own"
+    got = f"{workers}, scheduler {scheduler}"
+    require(fits, "workers", expected=expected, got=got, remedy="leave workers out")
     about = _about(plan)
     if target.exists():
         return _finished(target, plan, about)
@@ -167,13 +164,10 @@ class _Job:
                     np.save(new / "commands.npy", plan.commands.array)
                 create_chunked(new / "data", _header(plan, {}, []), plan.dtype)
                 write_json(new / "plan.json", about)
-        require(
-            (part / "plan.json").exists(),
-            "path",
-            expected=f"{part} to be free, or to hold an interrupted job",
-            got="something else there",
-            remedy="give another name, or remove it",
-        )
+        expected = f"{part} to be free, or to hold an interrupted job"
+        got = "something else there"
+        remedy = "give another name, or remove it"
+        require((part / "plan.json").exists(), "path", expected=expected, got=got, remedy=remedy)
         _check_same(part, json.loads((part / "plan.json").read_text("utf-8")), about)
         if isinstance(plan.commands, Recorded):
             plan = replace(plan, commands=Recorded(part / "commands.npy"))
@@ -312,13 +306,10 @@ def _check_same(where: Path, written: dict[str, Any], given: dict[str, Any]) -> 
 
 def _check_small(plan: SimulationPlan, workers: int | None, scheduler: str | None) -> None:
     size = plan.count * plan.trajectory_bytes
-    require(
-        size <= MAX_NPZ_BYTES and workers is None and scheduler is None,
-        "path",
-        expected=f"a folder *.zarr for more than {MAX_NPZ_BYTES >> 20} MB, or with workers",
-        got=f"a file *.npz for {size / 2**20:.0f} MB",
-        remedy="give a name that ends in .zarr",
-    )
+    fits = size <= MAX_NPZ_BYTES and workers is None and scheduler is None
+    expected = f"a folder *.zarr for more than {MAX_NPZ_BYTES >> 20} MB, or with workers"
+    got = f"a file *.npz for {size / 2**20:.0f} MB"
+    require(fits, "path", expected=expected, got=got, remedy="give a name that ends in .zarr")
 
 
 def _part(target: Path) -> Path:

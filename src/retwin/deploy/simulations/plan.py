@@ -180,13 +180,10 @@ class SimulationPlan:
         onsets = getattr(self.twin, "onsets", None)
         drawn = self.commands.sample(len(rows), rng=rng, onsets=onsets)
         drawn = checked_commands(drawn, self.twin.inputs)
-        require(
-            drawn.shape[:2] == (len(rows), self.steps),
-            "commands",
-            expected=f"{len(rows)} trajectories of {self.steps} samples from the sampler",
-            got=f"shape {drawn.shape}",
-            remedy="have `sample` return the requested number of trajectories, of `steps` samples",
-        )
+        fits = drawn.shape[:2] == (len(rows), self.steps)
+        expected = f"{len(rows)} trajectories of {self.steps} samples from the sampler"
+        remedy = "have `sample` return the requested number of trajectories, of `steps` samples"
+        require(fits, "commands", expected=expected, got=f"shape {drawn.shape}", remedy=remedy)
         return self._within(drawn).astype(self.dtype, copy=False)
 
     def _within(self, commands: NDArray) -> NDArray:
@@ -292,25 +289,11 @@ def _simulated(
                 raise
             made, failed = error.finished, dict(error.failed)
             good = np.array([int(each) for each in made.ids], dtype=int)
-    return _stored(plan, rows, commands, made, good, failed)
-
-
-def _stored(
-    plan: SimulationPlan,
-    rows: NDArray,
-    commands: NDArray,
-    made: Trajectories,
-    good: NDArray,
-    failed: dict[int, str],
-) -> SimulatedChunk:
     classes, width = rows % len(plan.faults), len(plan.twin.outputs)
-    require(
-        made.observed.shape == (len(good), plan.steps, width),
-        "twin",
-        expected=f"outputs of shape {(len(good), plan.steps, width)}",
-        got=made.observed.shape,
-        remedy="have `simulate` return one trajectory per command, on the commands' time grid",
-    )
+    fits = made.observed.shape == (len(good), plan.steps, width)
+    expected = f"outputs of shape {(len(good), plan.steps, width)}"
+    remedy = "have `simulate` return one trajectory per command, on the commands' time grid"
+    require(fits, "twin", expected=expected, got=made.observed.shape, remedy=remedy)
     given = {name: getattr(made, name) for name in ("commands", "nominal", "observed")}
     with np.errstate(over="ignore"):
         given = {name: array.astype(plan.dtype, copy=False) for name, array in given.items()}

@@ -69,13 +69,11 @@ class DANN:
         assert target is not None, "checked by fit_diagnoser"
         order = class_order(source, task.classes)
         features = Features.at(source, task.rate, hide_start=True)
-        require(
-            len(target) > 0 and target.steps == source.steps,
-            "target",
-            expected=f"at least one real trajectory of {source.steps} samples, as in the source",
-            got=f"{len(target)} of {target.steps} samples",
-            remedy="give the unlabelled real trajectories, cut to the source's length",
-        )
+        fits = len(target) > 0 and target.steps == source.steps
+        expected = f"at least one real trajectory of {source.steps} samples, as in the source"
+        got = f"{len(target)} of {target.steps} samples"
+        remedy = "give the unlabelled real trajectories, cut to the source's length"
+        require(fits, "target", expected=expected, got=got, remedy=remedy)
         fitted_on, held_out = source.split(0.8, seed=seed)
         with isolated(seed):
             diagnoser = NetworkDiagnoser(self.network, features, classes=order)

@@ -168,13 +168,10 @@ class Features:
 
     def _find_settled(self, trajectories: Trajectories) -> NDArray:
         """The sample (n,) up to which the start is hidden; the last one if nothing moves."""
-        require(
-            trajectories.commands.shape[2] > 0,
-            "trajectories.commands",
-            expected="commands, which show when the first motion ends",
-            got="none",
-            remedy="recover them, or take a diagnoser that does not hide the start",
-        )
+        fits = trajectories.commands.shape[2] > 0
+        expected = "commands, which show when the first motion ends"
+        remedy = "recover them, or take a diagnoser that does not hide the start"
+        require(fits, "trajectories.commands", expected=expected, got="none", remedy=remedy)
         segments = Segments.from_commands(trajectories.commands)
         if segments.max_count == 0:
             return np.full(len(trajectories), trajectories.steps - 1)
@@ -190,13 +187,9 @@ def random_phase(phases: Tensor, generator: torch.Generator) -> Tensor:
 
 def class_names(values: Sequence[object]) -> tuple[str, ...]:
     """Class names as a model folder holds them; InputError unless they are texts that differ."""
-    require(
-        all(isinstance(value, str) for value in values) and len(set(values)) == len(values),
-        "classes",
-        expected="names of classes, each once",
-        got=repr(values),
-        remedy="save the model again",
-    )
+    fits = all(isinstance(value, str) for value in values) and len(set(values)) == len(values)
+    expected = "names of classes, each once"
+    require(fits, "classes", expected=expected, got=repr(values), remedy="save the model again")
     return tuple(map(str, values))
 
 

@@ -58,13 +58,11 @@ class FineTune:
         """
         generated, target = task.trajectories, task.target
         assert target is not None, "checked by fit_diagnoser"
-        require(
-            task.classes is None and task.rate is None,
-            "classes and rate",
-            expected="none for FineTune, which keeps those of its base",
-            got=f"{task.classes} and {task.rate}",
-            remedy="leave them out, or train another base",
-        )
+        fits = task.classes is None and task.rate is None
+        expected = "none for FineTune, which keeps those of its base"
+        got = f"{task.classes} and {task.rate}"
+        remedy = "leave them out, or train another base"
+        require(fits, "classes and rate", expected=expected, got=got, remedy=remedy)
         base = self.base
         for part in (generated, target):
             class_order(part, base.classes)

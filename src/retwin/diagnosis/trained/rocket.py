@@ -68,13 +68,9 @@ class Rocket:
     kernels: int = 9996
 
     def __post_init__(self) -> None:
-        require(
-            whole("kernels", self.kernels, at_least=PATTERNS) % PATTERNS == 0,
-            "kernels",
-            expected=f"a multiple of {PATTERNS}",
-            got=self.kernels,
-            remedy="round it",
-        )
+        fits = whole("kernels", self.kernels, at_least=PATTERNS) % PATTERNS == 0
+        expected = f"a multiple of {PATTERNS}"
+        require(fits, "kernels", expected=expected, got=self.kernels, remedy="round it")
 
     def fit(self, task: TrainingTask) -> RocketDiagnoser:
         """Fit MiniRocket and a ridge; see `fit_diagnoser`.
@@ -84,12 +80,10 @@ class Rocket:
         of modern neural networks", ICML 2017).
         """
         trajectories, report = task.trajectories, task.progress or (lambda _: None)
+        expected = "none for Rocket, whose weights have a closed form"
+        remedy = "leave it out"
         require(
-            task.training is None,
-            "training",
-            expected="none for Rocket, whose weights have a closed form",
-            got=task.training,
-            remedy="leave it out",
+            task.training is None, "training", expected=expected, got=task.training, remedy=remedy
         )
         order = class_order(trajectories, task.classes)
         features = Features.at(trajectories, task.rate)
@@ -165,13 +159,11 @@ class RocketDiagnoser:
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes), see `Diagnoser`."""
         standard = (self.features(trajectories) - self.weights["mean"]) / self.weights["scale"]
-        require(
-            standard.shape[1] == self.samples,
-            "trajectories.steps",
-            expected=f"as many as it was trained on, {self.samples} samples of the features",
-            got=f"{standard.shape[1]} samples",
-            remedy="cut or pad them to that length",
-        )
+        fits = standard.shape[1] == self.samples
+        expected = f"as many as it was trained on, {self.samples} samples of the features"
+        got = f"{standard.shape[1]} samples"
+        remedy = "cut or pad them to that length"
+        require(fits, "trajectories.steps", expected=expected, got=got, remedy=remedy)
         convolved = _convolve(self._transform, standard)
         slope, level = (self.weights[name].double().numpy() for name in ("slope", "level"))
         found: NDArray = softmax(convolved @ slope.T + level, axis=1)
@@ -200,17 +192,8 @@ class RocketDiagnoser:
         return cls(features, names, about["samples"], weights, about["figures"])
 
 
-def _ridge(
-    convolved: NDArray, labels: NDArray, order: tuple[str, ...], *, absent: float = -2.0
-) -> tuple[NDArray, NDArray]:
-    """Slope (classes, kernels) and level (classes,) of the scores of the classes in `order`.
-
-    Parameters
-    ----------
-    absent : float, default -2.0
-        Score of a class that has no training example; scores of the others are near -1 and 1.
-
-    """
+def _ridge(convolved: NDArray, labels: NDArray, order: tuple[str, ...]) -> tuple[NDArray, NDArray]:
+    """Slope (classes, kernels) and level (classes,) of the scores of the classes in `order`."""
     from sklearn.linear_model import RidgeCV
     from sklearn.preprocessing import StandardScaler
 
@@ -218,7 +201,8 @@ def _ridge(
     scaler = StandardScaler().fit(convolved)
     ridge = RidgeCV(alphas=PENALTIES).fit(scaler.transform(convolved), 2.0 * truth - 1)
     slope = ridge.coef_ / scaler.scale_
-    return slope, np.where(truth.any(axis=0), ridge.intercept_ - slope @ scaler.mean_, absent)
+    # Score of a class that has no training example; scores of the others are near -1 and 1.
+    return slope, np.where(truth.any(axis=0), ridge.intercept_ - slope @ scaler.mean_, -2.0)
 
 
 def _temperature(scores: NDArray, truth: NDArray) -> tuple[float, float]:

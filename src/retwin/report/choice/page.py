@@ -9,13 +9,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.evaluation.choice.fitted import Fitted
 from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Table, tabulate
-from retwin.report.choice.tables import (
-    comparison_table,
-    model_sentences,
-    parameter_table,
-    term_table,
-    units_of,
-)
+from retwin.report.choice import tables
 from retwin.report.figures.figure import Band, Figure, Key, Line, Mark, record_panel
 from retwin.report.identification.figures import OUTPUTS, SAMPLES
 from retwin.report.labels import significant
@@ -52,11 +46,11 @@ def fit_page(found: Fitted, folder: str, *, title: str) -> str:
         folder=folder,
         taken=found.score(found.chosen),
         parts=", ".join(dict.fromkeys(found.parts)),
-        units=units_of(found),
-        comparison=comparison_table(found),
-        parameters=parameter_table(found),
-        terms=term_table(found),
-        sentences=model_sentences(found),
+        units=tables.units_of(found),
+        comparison=tables.comparison_table(found),
+        parameters=tables.parameter_table(found),
+        terms=tables.term_table(found),
+        sentences=tables.model_sentences(found),
         bands=_bands(found),
         promised=forecast is not None and forecast.promised,
         beyond=_beyond(found),
@@ -75,7 +69,7 @@ def _beyond(found: Fitted) -> dict[str, float]:
 
 
 def _bands(found: Fitted) -> Table:
-    forecast, units = found.twin.forecast, units_of(found)
+    forecast, units = found.twin.forecast, tables.units_of(found)
     if forecast is None:
         return Table("", [], [])
     rows = []

@@ -10,18 +10,8 @@ from retwin.data.quality.check import Checked
 from retwin.evaluation.identification.validation import Identification
 from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Cell, Table, grouped, tabulate, text_column
+from retwin.report.identification import texts
 from retwin.report.identification.figures import INPUTS, OUTPUTS, figures
-from retwin.report.identification.texts import (
-    change,
-    combination,
-    findings,
-    interval,
-    interval_remark,
-    next_steps,
-    percent,
-    state,
-    value,
-)
 from retwin.report.labels import behind, number, p_value, shown_unit, signed, significant
 from retwin.report.records import TITLE, records_part
 from retwin.update.dynamics.unknowns import state_names
@@ -74,9 +64,9 @@ def identification_page(
         command=command,
         folder=folder,
         states=bool(state_names(found.twin)),
-        findings=findings(found, values["notes"]),
-        interval_remark=interval_remark(found),
-        steps=next_steps(found),
+        findings=texts.findings(found, values["notes"]),
+        interval_remark=texts.interval_remark(found),
+        steps=texts.next_steps(found),
         figures=drawn,
         parameters=_parameters(found),
         directions=_directions(found),
@@ -92,10 +82,10 @@ def _parameters(found: Identification) -> Table:
         [
             Cell(each.name, shown_unit(each.unit)),
             "–" if each.own else significant(each.start),
-            Cell(value(each), best=True),
-            interval(each),
+            Cell(texts.value(each), best=True),
+            texts.interval(each),
             f"{significant(each.low)} to {significant(each.high)}",
-            Cell(state(each) or "identified", tone="open" if state(each) else ""),
+            Cell(texts.state(each) or "identified", tone="open" if texts.state(each) else ""),
         ]
         for each in found.parameters
     ]
@@ -108,7 +98,7 @@ def _parameters(found: Identification) -> Table:
 def _directions(found: Identification) -> Table:
     rows = [
         [
-            combination(each),
+            texts.combination(each),
             significant(each.error) if each.error < 1e6 else "infinite",
             Cell("open" if each.open else "determined", tone="open" if each.open else ""),
         ]
@@ -148,7 +138,8 @@ def _errors(found: Identification) -> Table:
                 # Worse than the mean.
                 Cell(behind(number(100 * share, 1), "%"), tone="open" if share > 1 else ""),
                 Cell(
-                    change(error, interval=False), " to ".join(map(percent, error.interval or ()))
+                    texts.change(error, interval=False),
+                    " to ".join(map(texts.percent, error.interval or ())),
                 ),
             ]
         rows.append(row)

@@ -4,18 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from retwin.report import labels
 from retwin.report.blocks import Cell, Section, Table, tabulate
 from retwin.report.figures.figure import Axis, Figure, Key, Line, Panel, Row, bar, outline
 from retwin.report.figures.style import colour_of
-from retwin.report.labels import (
-    latent_names,
-    number,
-    order,
-    source_name,
-    span,
-    with_role,
-    with_unit,
-)
 from retwin.report.sections.segment import segment, segment_figure
 from retwin.report.study import Component, Study
 from retwin.results import FidelityFigure
@@ -47,19 +39,19 @@ def discrepancy(study: Study) -> Section | None:
 
 def suffixes(study: Study) -> dict[str, str]:
     """The end of the figures' names for each source: empty for the first, then -2, -3."""
-    known = order(study.results.fidelity)
+    known = labels.order(study.results.fidelity)
     return {source: f"-{place + 1}" if place else "" for place, source in enumerate(known)}
 
 
 def detailed(study: Study) -> list[str]:
     """Sources that are shown in detail; of many, the updated ones."""
-    known = order(study.results.fidelity)
-    return known if len(known) <= FEW else with_role(known, "updated") or known[-FEW:]
+    known = labels.order(study.results.fidelity)
+    return known if len(known) <= FEW else labels.with_role(known, "updated") or known[-FEW:]
 
 
 def titled(study: Study, source: str, title: str) -> str:
     """The title of a table, with the source where there are several."""
-    return f"{title}, {source_name(source)}" if len(study.results.fidelity) > 1 else title
+    return f"{title}, {labels.source_name(source)}" if len(study.results.fidelity) > 1 else title
 
 
 def figure_cell(figure: FidelityFigure | None, digits: int = 3, factor: float = 1.0) -> Cell:
@@ -67,8 +59,8 @@ def figure_cell(figure: FidelityFigure | None, digits: int = 3, factor: float = 
     if figure is None:
         return Cell("–")
     scaled = None if figure.ends is None else [factor * end for end in figure.ends]
-    below = "" if scaled is None else f"[{span(scaled, digits)}]"
-    return Cell(number(factor * figure.value, digits), below)
+    below = "" if scaled is None else f"[{labels.span(scaled, digits)}]"
+    return Cell(labels.number(factor * figure.value, digits), below)
 
 
 def latents(study: Study, source: str) -> list[Component]:
@@ -97,7 +89,7 @@ def _figure(source: str, name: str, shown: list[Component]) -> Figure:
 
 
 def _panel(latent: Component, colour: str) -> Panel:
-    title, label = latent_names(latent.name)
+    title, label = labels.latent_names(latent.name)
     values = latent.values
     assert values is not None
     low, high = float(values.edges[0]), float(values.edges[-1])
@@ -105,10 +97,10 @@ def _panel(latent: Component, colour: str) -> Panel:
         bar(values.edges, values.observed, "observed", "observed"),
         Line(*outline(values.edges, values.generated), "generated", colour, width=2.2),
     ]
-    limits = f"{number(low, 1)} to {number(high, 1)}"
+    limits = f"{labels.number(low, 1)} to {labels.number(high, 1)}"
     x = Axis(label, latent.unit, (low, high), count=7)
     y = Axis("share per bin", kind="percent", from_zero=True)
-    alt = with_unit(f"{title}, observed and generated, {limits}", latent.unit)
+    alt = labels.with_unit(f"{title}, observed and generated, {limits}", latent.unit)
     return Panel(x, [Row(y, marks)], alt, title, height=300)
 
 
@@ -116,9 +108,9 @@ def _agreement(study: Study, source: str) -> Table | None:
     fidelity = study.results.fidelity[source]
     rows = [
         [
-            latent_names(name)[0],
+            labels.latent_names(name)[0],
             figure_cell(distance, 2),
-            number(distance.p, 2),
+            labels.number(distance.p, 2),
             figure_cell(fidelity.figures.get(f"coverage90/{name}"), 2),
         ]
         for name, distance in fidelity.agreement.items()

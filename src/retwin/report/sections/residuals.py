@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import runs
-from retwin.report.blocks import Cell, Section, Table, tabulate
+from retwin.report.blocks import Cell, Section, tabulate
 from retwin.report.figures.figure import Axis, Figure, Key, Mark, Panel, Points, Row, Spans
 from retwin.report.figures.residual_panels import (
     ChannelRecords,
@@ -52,8 +52,19 @@ def residuals(study: Study) -> Section | None:
     ]
     figures = _figures(study, drawn, commands, outside)
     figures = [each for each in figures if each.panels]
+    heads = ["Source", "RMSE", "mean error", "largest autocorrelation", "p, white"]
+    heads += ["largest correlation with a command", "RMSE outside the calibration"]
+    rows: list[list[object]] = []
+    for each in errors:
+        if len(errors) > 1:
+            rows.append([with_unit(each.output.name, each.output.unit)])
+        for source, error in zip(known, each.by_key.values(), strict=True):
+            found = _row(error, commands, each.lags, outside, _rate(study))
+            rows.append([Cell(source_name(source), source=source), *found])
+    title = "Residuals of all sources"
+    title = title if len(errors) > 1 else with_unit(title, errors[0].output.unit)
     values = {
-        "table": _table(study, known, errors, commands, outside),
+        "table": tabulate(title, heads, rows),
         "figures": {each.name: each for each in figures},
         "best": min(known, key=lambda name: study.sources[name].mean("nrmse")),
         "limited": len(errors) > OUTPUTS or len(commands) > COMMANDS,
@@ -119,26 +130,6 @@ def _errors(study: Study, sources: Sequence[str]) -> list[Errors]:
         errors = {_key(name): each.values - factor * mean[..., i] for name, mean in means.items()}
         made.append(Errors(each, errors))
     return made
-
-
-def _table(
-    study: Study,
-    sources: Sequence[str],
-    errors: list[Errors],
-    commands: list[ChannelRecords],
-    outside: NDArray,
-) -> Table:
-    heads = ["Source", "RMSE", "mean error", "largest autocorrelation", "p, white"]
-    heads += ["largest correlation with a command", "RMSE outside the calibration"]
-    rows: list[list[object]] = []
-    for each in errors:
-        if len(errors) > 1:
-            rows.append([with_unit(each.output.name, each.output.unit)])
-        for source, error in zip(sources, each.by_key.values(), strict=True):
-            found = _row(error, commands, each.lags, outside, _rate(study))
-            rows.append([Cell(source_name(source), source=source), *found])
-    title, output = "Residuals of all sources", errors[0].output
-    return tabulate(title if len(errors) > 1 else with_unit(title, output.unit), heads, rows)
 
 
 def _row(

@@ -77,12 +77,7 @@ def _ramp(start: NDArray, levels: NDArray, spans: NDArray, onsets: NDArray, step
 
 
 def draw_onsets(
-    count: int,
-    segments: int,
-    period: float,
-    *,
-    rng: np.random.Generator,
-    given: NDArray | None = None,
+    count: int, segments: int, period: float, *, rng: np.random.Generator, given: NDArray | None
 ) -> NDArray:
     """Draw the onsets of segments.
 

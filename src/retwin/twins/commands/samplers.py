@@ -55,7 +55,32 @@ class CommandSampler(Protocol):
 
 
 @dataclass(frozen=True)
-class RampSampler(Timed):
+class BoundedSampler(Timed):
+    """The base of samplers of levels between two limits of each input channel."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    rate: float
+    duration: float
+
+    def __post_init__(self) -> None:
+        low, high = self._bounds
+        paired = low.ndim == 1 and low.shape == high.shape and len(low) > 0
+        fits = paired and np.isfinite([low, high]).all() and (low < high).all()
+        expected = "a finite low and a greater finite high per input channel"
+        got = f"low {self.low}, high {self.high}"
+        remedy = "give the range from which levels are drawn"
+        require(fits, "limits", expected=expected, got=got, remedy=remedy)
+        self.check_steps()
+
+    @property
+    def _bounds(self) -> tuple[NDArray, NDArray]:
+        """Both limits as arrays (d_u,)."""
+        return np.array(self.low, float), np.array(self.high, float)
+
+
+@dataclass(frozen=True)
+class RampSampler(BoundedSampler):
     """Commands that ramp to a random level, hold it, and ramp to the next.
 
     Parameters
@@ -82,36 +107,26 @@ class RampSampler(Timed):
 
     """
 
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    rate: float
-    duration: float
     segments: int
     ramp_durations: tuple[float, ...] = ()
     start: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        low, high = _check_limits(self.low, self.high)
-        rest = np.array(self.rest)
-        require(
-            rest.shape == low.shape and bool(((low <= rest) & (rest <= high)).all()),
-            "start",
-            expected=f"one level within the limits per input channel, {len(low)}",
-            got=self.start,
-            remedy="leave start out to begin in the middle of the limits",
-        )
-        self.check_steps()
+        super().__post_init__()
+        rest, (low, high) = np.array(self.rest), self._bounds
+        fits = rest.shape == low.shape and bool(((low <= rest) & (rest <= high)).all())
+        expected = f"one level within the limits per input channel, {len(low)}"
+        remedy = "leave start out to begin in the middle of the limits"
+        require(fits, "start", expected=expected, got=self.start, remedy=remedy)
         remedy = "give the number of levels that a trajectory goes to, a sample or more each"
         whole("segments", self.segments, at_least=1, at_most=self.steps, remedy=remedy)
         longest = self.steps // self.segments
-        require(
-            np.isfinite(self.ramp_durations).all()
-            and all(1 <= ramp <= longest for ramp in self._ramps),
-            "ramp_durations",
-            expected=f"from {1 / self.rate:g} s, a sample, to {longest / self.rate:g} s, a segment",
-            got=self.ramp_durations,
-            remedy="give shorter ramps in seconds, fewer segments or a longer duration",
-        )
+        fits = bool(np.isfinite(self.ramp_durations).all())
+        fits = fits and all(1 <= ramp <= longest for ramp in self._ramps)
+        expected = f"from {1 / self.rate:g} s, a sample, to {longest / self.rate:g} s, a segment"
+        remedy = "give shorter ramps in seconds, fewer segments or a longer duration"
+        got = self.ramp_durations
+        require(fits, "ramp_durations", expected=expected, got=got, remedy=remedy)
 
     @property
     def _ramps(self) -> list[int]:
@@ -146,7 +161,7 @@ class RampSampler(Timed):
 
 
 @dataclass(frozen=True)
-class HoldSampler(Timed):
+class HoldSampler(BoundedSampler):
     """Random levels, each held for a random time, independently in every channel.
 
     This is an amplitude-modulated pseudo-random binary signal (APRBS): steps of all sizes and of
@@ -172,24 +187,16 @@ class HoldSampler(Timed):
 
     """
 
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    rate: float
-    duration: float
     hold_durations: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        _check_limits(self.low, self.high)
-        self.check_steps()
-        require(
-            np.isfinite(self.hold_durations).all()
-            and len(self._hold) == 2
-            and 1 <= self._hold[0] <= self._hold[1],
-            "hold_durations",
-            expected="a pair (shortest, longest) in s, at least a sample and in order",
-            got=self.hold_durations,
-            remedy="make the longest hold longer than the slowest state takes to settle",
-        )
+        super().__post_init__()
+        fits = np.isfinite(self.hold_durations).all() and len(self._hold) == 2
+        fits = fits and 1 <= self._hold[0] <= self._hold[1]
+        expected = "a pair (shortest, longest) in s, at least a sample and in order"
+        remedy = "make the longest hold longer than the slowest state takes to settle"
+        got = self.hold_durations
+        require(fits, "hold_durations", expected=expected, got=got, remedy=remedy)
 
     @property
     def _hold(self) -> list[int]:
@@ -211,7 +218,7 @@ class HoldSampler(Timed):
 
 
 @dataclass(frozen=True)
-class MultisineSampler(Timed):
+class MultisineSampler(BoundedSampler):
     """Multisines of random phases about a mean, independently in every channel.
 
     Parameters
@@ -242,10 +249,6 @@ class MultisineSampler(Timed):
 
     """
 
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    rate: float
-    duration: float
     band: tuple[float, float]
     corner: float | None = None
     weak: float = 0.1
@@ -253,32 +256,25 @@ class MultisineSampler(Timed):
     deviation: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        low, high = _check_limits(self.low, self.high)
-        self.check_steps()
+        super().__post_init__()
+        low, high = self._bounds
         mean, deviation = self.mean or (low + high) / 2, self.deviation or (high - low) / 6
-        fits = np.shape(mean) == np.shape(deviation) == low.shape
-        require(
-            fits and ((low <= mean) & (mean <= high) & (np.array(deviation) >= 0)).all(),
-            "mean",
-            expected=f"{len(low)} means within the limits, and as many deviations from 0",
-            got=f"mean {self.mean}, deviation {self.deviation}",
-            remedy="leave them out for the middle of the limits and a sixth of their distance",
-        )
-        require(
-            len(self.band) == 2 and 0 < self.band[0] <= self.band[1] <= self.rate / 2,
-            "band",
-            expected=f"a pair (lowest, highest) in Hz, above 0, in order, to {self.rate / 2:g} Hz",
-            got=self.band,
-            remedy="give the frequencies that real commands have",
-        )
+        shaped = np.shape(mean) == np.shape(deviation) == low.shape
+        within = shaped and (low <= mean) & (mean <= high) & (np.array(deviation) >= 0)
+        fits = bool(np.all(within))
+        expected = f"{len(low)} means within the limits, and as many deviations from 0"
+        got = f"mean {self.mean}, deviation {self.deviation}"
+        remedy = "leave them out for the middle of the limits and a sixth of their distance"
+        require(fits, "mean", expected=expected, got=got, remedy=remedy)
+        fits = len(self.band) == 2 and 0 < self.band[0] <= self.band[1] <= self.rate / 2
+        expected = f"a pair (lowest, highest) in Hz, above 0, in order, to {self.rate / 2:g} Hz"
+        remedy = "give the frequencies that real commands have"
+        require(fits, "band", expected=expected, got=self.band, remedy=remedy)
         corner = self.band[1] if self.corner is None else self.corner
-        require(
-            self.band[0] <= corner <= self.band[1] and self.weak >= 0,
-            "corner",
-            expected=f"from {self.band[0]:g} to {self.band[1]:g} Hz, and weak from 0",
-            got=f"corner {self.corner}, weak {self.weak}",
-            remedy="leave them out for the default",
-        )
+        fits = self.band[0] <= corner <= self.band[1] and self.weak >= 0
+        expected = f"from {self.band[0]:g} to {self.band[1]:g} Hz, and weak from 0"
+        got, remedy = f"corner {self.corner}, weak {self.weak}", "leave them out for the default"
+        require(fits, "corner", expected=expected, got=got, remedy=remedy)
         object.__setattr__(self, "corner", corner)
         object.__setattr__(self, "mean", tuple(map(float, mean)))
         object.__setattr__(self, "deviation", tuple(map(float, deviation)))
@@ -343,13 +339,10 @@ class RecordedSampler(Timed):
         longest = shape[1] / sample_rate("rate", self.rate)
         object.__setattr__(self, "duration", float(self.duration or longest))
         self.check_steps()
-        require(
-            self.steps <= shape[1],
-            "duration",
-            expected=f"at most {longest:g} s, the duration of the records",
-            got=f"{self.duration:g} s",
-            remedy="give shorter pieces",
-        )
+        expected = f"at most {longest:g} s, the duration of the records"
+        got = f"{self.duration:g} s"
+        remedy = "give shorter pieces"
+        require(self.steps <= shape[1], "duration", expected=expected, got=got, remedy=remedy)
 
     def sample(
         self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None
@@ -359,20 +352,6 @@ class RecordedSampler(Timed):
         row = rng.integers(records, size=(count, 1))
         begin = rng.integers(samples - self.steps, size=(count, 1), endpoint=True)
         return self.commands[row, begin + np.arange(self.steps)].astype(np.float32)
-
-
-def _check_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[NDArray, NDArray]:
-    """Both as arrays (d_u,), finite and in order."""
-    lower, upper = np.array(low, float), np.array(high, float)
-    paired = lower.ndim == 1 and lower.shape == upper.shape and len(lower) > 0
-    require(
-        paired and np.isfinite([lower, upper]).all() and (lower < upper).all(),
-        "limits",
-        expected="a finite low and a greater finite high per input channel",
-        got=f"low {low}, high {high}",
-        remedy="give the range from which levels are drawn",
-    )
-    return lower, upper
 
 
 def _in_samples(

@@ -231,13 +231,9 @@ def trace_model(
 
 def with_parameters(function: Callable[..., Any] | None) -> Callable[..., Any]:
     """A function of x, u and p, where the user's may leave out p."""
-    require(
-        callable(function),
-        "output",
-        expected="functions of x, u and p",
-        got=repr(function),
-        remedy="give functions that can be called",
-    )
+    expected = "functions of x, u and p"
+    remedy = "give functions that can be called"
+    require(callable(function), "output", expected=expected, got=repr(function), remedy=remedy)
     assert function is not None
     places = [
         each

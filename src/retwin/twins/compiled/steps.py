@@ -118,7 +118,7 @@ class Steps:
             if changes is None:
                 changes = np.zeros((*c.shape[:2], len(self.model.variables["p"])))
             given = zip(c, theta, process, *measured, changes, spread, strict=True)
-            every = [self._filter_row(*map(_double, (*row, *common))) for row in given]
+            every = [self._filter_row(*row, *common) for row in given]
             mean, covariance, x, after = (np.stack(each) for each in zip(*every, strict=True))
             return mean, covariance, x, after
         after = np.array(spread, np.float64)
@@ -133,19 +133,9 @@ class Steps:
         call(library, "filter", (*shape, self.substeps), self.period, shared, rows)
         return made[0], made[1], made[2], after
 
-    def _filter_row(
-        self,
-        c: Tensor,
-        theta: Tensor,
-        process: Tensor,
-        outputs: Tensor,
-        seen: Tensor,
-        changes: Tensor,
-        spread: Tensor,
-        noise: Tensor,
-        gate: Tensor,
-    ) -> list[NDArray]:
+    def _filter_row(self, *row: NDArray) -> list[NDArray]:
         """See `filter`, for one trajectory."""
+        c, theta, process, outputs, seen, changes, spread, noise, gate = map(_double, row)
         constant, start = self._split(theta[:, None].unbind(0))
         x = torch.cat(list(start))
         made = []

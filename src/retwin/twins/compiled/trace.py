@@ -107,26 +107,21 @@ def traced(
             returned = function(*arguments)
         except _RefusedError as error:
             known = sorted(e for e in ELEMENTWISE if e not in COMPARISONS and "bitwise" not in e)
-            raise InputError(
-                role,
-                expected="operations of torch or numpy on scalars, without branches that depend "
-                "on them",
-                got=str(error),
-                remedy="use torch.where, torch.sqrt, … in place of if and math; there are "
-                f"{', '.join(known)}",
-            ) from None
+            expected = "operations of torch or numpy on scalars, without branches that depend "
+            expected += "on them"
+            remedy = "use torch.where, torch.sqrt, … in place of if and math; there are "
+            remedy += f"{', '.join(known)}"
+            raise InputError(role, expected=expected, got=str(error), remedy=remedy) from None
     if isinstance(returned, Tensor):
         returned = returned.unbind() if returned.ndim else [returned]
     returned = returned if isinstance(returned, Sequence) else [returned]
     results = [_element(program, each) for each in returned]
     good = len(results) == count and all(isinstance(each, Node) for each in results)
     if not good:
-        raise InputError(
-            role,
-            expected=f"a function that returns {count} scalars, one for each name in order",
-            got=f"{len(results)}: {', '.join(type(each).__name__ for each in returned)}",
-            remedy="return a tuple with one tensor without axes, or one number, for each",
-        )
+        expected = f"a function that returns {count} scalars, one for each name in order"
+        got = f"{len(results)}: {', '.join(type(each).__name__ for each in returned)}"
+        remedy = "return a tuple with one tensor without axes, or one number, for each"
+        raise InputError(role, expected=expected, got=got, remedy=remedy)
     return results
 
 

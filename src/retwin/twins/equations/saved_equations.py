@@ -81,13 +81,10 @@ def equations_from(kind: type[Kind], about: dict[str, Any]) -> Kind:
         else:
             nodes.append(known[value] if op == "variable" else program.constant(value))
     slope, results = ([nodes[i] for i in about[name]] for name in ("slope", "results"))
-    require(
-        (len(slope), len(results)) == (len(states), len(outputs)),
-        "operations",
-        expected=f"{len(states)} states and {len(outputs)} outputs as results",
-        got=f"{len(slope)} and {len(results)}",
-        remedy="save the model again",
-    )
+    fits = (len(slope), len(results)) == (len(states), len(outputs))
+    expected = f"{len(states)} states and {len(outputs)} outputs as results"
+    got = f"{len(slope)} and {len(results)}"
+    require(fits, "operations", expected=expected, got=got, remedy="save the model again")
     discrete = one_of("discrete", about["discrete"], (True, False))
     model = Model(program, variables, slope, results, discrete)
     twin = kind(  # type: ignore[call-arg]  # which this module does not import

@@ -44,13 +44,11 @@ class State:
     high: float | None = None
 
     def __post_init__(self) -> None:
-        require(
-            (self.low is None) == (self.high is None) and np.isfinite(self.initial),
-            f"state {self.name!r}",
-            expected="a finite start, and both low and high or neither",
-            got=f"start {self.start}, low {self.low}, high {self.high}",
-            remedy="give both bounds of an unknown start",
-        )
+        fits = (self.low is None) == (self.high is None) and np.isfinite(self.initial)
+        expected = "a finite start, and both low and high or neither"
+        got = f"start {self.start}, low {self.low}, high {self.high}"
+        remedy = "give both bounds of an unknown start"
+        require(fits, f"state {self.name!r}", expected=expected, got=got, remedy=remedy)
         self.unknown()
 
     @property
@@ -77,10 +75,8 @@ def check_delays(
     for command, name in delays.items():
         one_of("delays", command, commands)
         parameter = own[one_of("delays", name, tuple(own))]
-        require(
-            parameter.unit == "s" and parameter.low >= 0,
-            "delays",
-            expected="a parameter in s whose lowest value is at least 0",
-            got=f"{name} in {parameter.unit}, from {parameter.low:g}",
-            remedy="give the parameter that unit and other bounds",
-        )
+        fits = parameter.unit == "s" and parameter.low >= 0
+        expected = "a parameter in s whose lowest value is at least 0"
+        got = f"{name} in {parameter.unit}, from {parameter.low:g}"
+        remedy = "give the parameter that unit and other bounds"
+        require(fits, "delays", expected=expected, got=got, remedy=remedy)

@@ -141,13 +141,11 @@ class StateTwin(AdjustableTwin):
         whole("substeps", self.substeps, at_least=1, at_most=MAX_SUBSTEPS)
         if self.interpolation is not None:
             one_of("interpolation", self.interpolation, INTERPOLATIONS)
-        require(
-            self.step is None or (self.substeps == 1 and self.interpolation in {None, "hold"}),
-            "step",
-            expected="substeps=1 and interpolation='hold'",
-            got=f"substeps={self.substeps}, interpolation={self.interpolation!r}",
-            remedy="leave both out: a step covers one sample period",
-        )
+        fits = self.step is None or (self.substeps == 1 and self.interpolation in {None, "hold"})
+        expected = "substeps=1 and interpolation='hold'"
+        got = f"substeps={self.substeps}, interpolation={self.interpolation!r}"
+        remedy = "leave both out: a step covers one sample period"
+        require(fits, "step", expected=expected, got=got, remedy=remedy)
         check_delays(self.delays, self.inputs.names, self.parameters)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -90,6 +90,10 @@ class Fault(Protocol):
         return response
 
 
+Faults = Sequence[Fault | None]
+"""One per trajectory, None for a healthy one."""
+
+
 def ends_of(value: Any) -> tuple[float, float]:
     """Ends of what is a number or a pair (low, high) of them; NaN for anything else."""
     ends = value if isinstance(value, Sequence) else (value,) * 2
@@ -100,13 +104,9 @@ def ends_of(value: Any) -> tuple[float, float]:
 def checked_onset(onset: float | tuple[float, float]) -> tuple[float, float]:
     """Earliest and latest onset in s; InputError for anything but times from 0 on, in order."""
     low, high = ends_of(onset)
-    require(
-        0 <= low <= high < math.inf,
-        "onset",
-        expected="a time in s from 0 on, or a pair (low, high) of them, in order",
-        got=repr(onset),
-        remedy="count the seconds from the first sample",
-    )
+    expected = "a time in s from 0 on, or a pair (low, high) of them, in order"
+    remedy = "count the seconds from the first sample"
+    require(0 <= low <= high < math.inf, "onset", expected=expected, got=repr(onset), remedy=remedy)
     return low, high
 
 
@@ -116,13 +116,9 @@ def onset_samples(onset: float | tuple[float, float], steps: int, rate: float) -
     Raises InputError if the earliest onset is after the end.
     """
     low, high = (to_samples(each, rate) for each in ends_of(onset))
-    require(
-        low < steps,
-        "onset",
-        expected=f"a time in s within the trajectory, which lasts {steps / rate:g} s",
-        got=f"{ends_of(onset)[0]:g} s",
-        remedy="give an earlier one, in seconds and not in samples",
-    )
+    expected = f"a time in s within the trajectory, which lasts {steps / rate:g} s"
+    remedy = "give an earlier one, in seconds and not in samples"
+    require(low < steps, "onset", expected=expected, got=f"{ends_of(onset)[0]:g} s", remedy=remedy)
     return low, min(high, steps - 1)
 
 

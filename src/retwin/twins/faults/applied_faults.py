@@ -5,8 +5,6 @@ A fault holds times in seconds, and gets the sample rate of the arrays that it c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,11 +12,11 @@ from retwin.checks import one_per, require
 from retwin.data.segments import Segments
 from retwin.times import to_samples
 from retwin.twins.compiled.commands import biased_references
-from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Stuck
+from retwin.twins.faults.actuator_faults import ActuatorBias, Fault, Faults, Stuck
 
 
 def draw_faults(
-    faults: Sequence[Fault | None], segments: Segments, seed: int, *, rate: float
+    faults: Faults, segments: Segments, seed: int, *, rate: float
 ) -> list[Fault | None]:
     """Draw the severity of every fault.
 
@@ -57,7 +55,7 @@ def draw_faults(
 
 
 def faulty_commands(
-    commands: NDArray, faults: Sequence[Fault | None], segments: Segments, *, rate: float
+    commands: NDArray, faults: Faults, segments: Segments, *, rate: float
 ) -> NDArray:
     """Commands with the effect of every fault on the reference.
 
@@ -95,7 +93,7 @@ def faulty_commands(
     return out
 
 
-def frozen_response(response: NDArray, faults: Sequence[Fault | None], *, rate: float) -> NDArray:
+def frozen_response(response: NDArray, faults: Faults, *, rate: float) -> NDArray:
     """Response of the actuators with the effect of every fault on it.
 
     A twin whose actuators cannot be accessed applies this to its commands, which are then held.
@@ -122,9 +120,7 @@ def frozen_response(response: NDArray, faults: Sequence[Fault | None], *, rate: 
     return out
 
 
-def frozen_from(
-    faults: Sequence[Fault | None], steps: int, actuators: int, *, rate: float
-) -> NDArray:
+def frozen_from(faults: Faults, steps: int, actuators: int, *, rate: float) -> NDArray:
     """Sample from which every actuator is held.
 
     For twins that integrate their dynamics and must hold an actuator meanwhile. The sample is
@@ -165,12 +161,9 @@ def frozen_from(
         if response is rising:
             continue
         onset = response[-1].astype(int)
-        require(
-            np.array_equal(response, np.minimum(rising, onset)),
-            "faults",
-            expected="faults that hold an actuator's response or leave it as it is",
-            got=fault,
-            remedy="use a twin that computes its actuators' response, or faults of the command",
-        )
+        fits = np.array_equal(response, np.minimum(rising, onset))
+        expected = "faults that hold an actuator's response or leave it as it is"
+        remedy = "use a twin that computes its actuators' response, or faults of the command"
+        require(fits, "faults", expected=expected, got=fault, remedy=remedy)
         onsets[i] = np.where(onset < steps - 1, onset, steps)
     return onsets

@@ -20,6 +20,7 @@ from retwin.times import to_samples
 from retwin.twins.faults.actuator_faults import (
     ActuatorBias,
     Fault,
+    Faults,
     Stuck,
     checked_onset,
     ends_of,
@@ -59,13 +60,10 @@ class TimedFault(Fault):
         if self.end is None:
             return
         first, last = ends_of(self.end)
-        require(
-            low < first <= last < math.inf and high < last,
-            "end",
-            expected=f"a time in s after the onset at {self.onset}, or a pair (low, high) of them",
-            got=repr(self.end),
-            remedy="leave it out for a fault that lasts",
-        )
+        fits = low < first <= last < math.inf and high < last
+        expected = f"a time in s after the onset at {self.onset}, or a pair (low, high) of them"
+        remedy = "leave it out for a fault that lasts"
+        require(fits, "end", expected=expected, got=repr(self.end), remedy=remedy)
 
     def onset_range(self, steps: int, rate: float) -> tuple[int, int]:
         """First and last sample at which it can begin in a trajectory of so many samples.
@@ -123,13 +121,10 @@ class SizedFault(TimedFault):
     def __post_init__(self) -> None:
         super().__post_init__()
         low, high = ends_of(self.size)
-        require(
-            -math.inf < low <= high < math.inf and not low == high == 0,
-            "size",
-            expected="a number other than 0, or a pair (low, high) in order",
-            got=repr(self.size),
-            remedy="give the sizes of real faults, with their sign",
-        )
+        fits = -math.inf < low <= high < math.inf and not low == high == 0
+        expected = "a number other than 0, or a pair (low, high) in order"
+        remedy = "give the sizes of real faults, with their sign"
+        require(fits, "size", expected=expected, got=repr(self.size), remedy=remedy)
 
     def drawn(self, rng: np.random.Generator, *, steps: int, segments: int, rate: float) -> Self:
         """The same fault with all that is open drawn; see `Fault.drawn`."""
@@ -298,7 +293,7 @@ FAULTS: tuple[type, ...] = (
 """The kinds of faults that a file may name."""
 
 
-def measured_with(observed: NDArray, faults: Sequence[Fault | None], rate: float) -> NDArray:
+def measured_with(observed: NDArray, faults: Faults, rate: float) -> NDArray:
     """Outputs (n, T, d_y) as sensors with these faults, one per trajectory, measure them."""
     rows = [i for i, fault in enumerate(faults) if isinstance(fault, TimedFault)]
     if not rows:
@@ -309,15 +304,13 @@ def measured_with(observed: NDArray, faults: Sequence[Fault | None], rate: float
     return made
 
 
-def without_sensor_faults(faults: Sequence[Fault | None]) -> list[Fault | None]:
+def without_sensor_faults(faults: Faults) -> list[Fault | None]:
     """The faults without those of sensors, which act on what a wrapper makes of the outputs."""
     sensors = (SensorBias, SensorDrift, SensorFreeze)
     return [None if isinstance(fault, sensors) else fault for fault in faults]
 
 
-def parameter_changes(
-    faults: Sequence[Fault | None], names: Sequence[str], steps: int, rate: float
-) -> NDArray:
+def parameter_changes(faults: Faults, names: Sequence[str], steps: int, rate: float) -> NDArray:
     """What faults add to the parameters `names` at each sample, (n, T, q)."""
     made = np.zeros((len(faults), steps, len(names)))
     for i, fault in enumerate(faults):
@@ -326,9 +319,7 @@ def parameter_changes(
     return made
 
 
-def check_faults(
-    faults: Sequence[Fault | None], inputs: int, outputs: int, shiftable: Sequence[str]
-) -> None:
+def check_faults(faults: Faults, inputs: int, outputs: int, shiftable: Sequence[str]) -> None:
     """Refuse faults of actuators, outputs and parameters that a twin does not have.
 
     Parameters
@@ -348,13 +339,10 @@ def check_faults(
     """
     for fault in {id(fault): fault for fault in faults}.values():  # thousands are the same object
         for name, count in (("actuator", inputs), ("output", outputs)):
-            require(
-                0 <= getattr(fault, name, 0) < count or not hasattr(fault, name),
-                "faults",
-                expected=f"an {name} from 0 to {count - 1}",
-                got=fault,
-                remedy=f"count the {'command' if name == 'actuator' else name} channels from 0",
-            )
+            fits = 0 <= getattr(fault, name, 0) < count or not hasattr(fault, name)
+            expected = f"an {name} from 0 to {count - 1}"
+            remedy = f"count the {'command' if name == 'actuator' else name} channels from 0"
+            require(fits, "faults", expected=expected, got=fault, remedy=remedy)
         if isinstance(fault, ParameterFault):
             require(
                 fault.parameter in shiftable,

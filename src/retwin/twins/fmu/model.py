@@ -212,12 +212,10 @@ def find_scalars(description: Any, argument: str, names: Sequence[str]) -> list[
         if name not in found:
             every = {variable.name: variable for variable in description.modelVariables}
             local = " or local" if causality == "output" else ""
-            raise InputError(
-                argument,
-                expected=f"variables that are an {causality}{local} and a number",
-                got=f"{name!r}, {_description(every.get(name))}",
-                remedy=_close_matches(name, found),
-            )
+            expected = f"variables that are an {causality}{local} and a number"
+            got = f"{name!r}, {_description(every.get(name))}"
+            remedy = _close_matches(name, found)
+            raise InputError(argument, expected=expected, got=got, remedy=remedy)
         chosen.append(found[name])
     return chosen
 
@@ -235,13 +233,10 @@ def _scalars(variable: Any, argument: str, *, max_scalars: int = 1_000_000) -> I
     if not variable.shape:
         yield Scalar(variable.name, variable)
         return
-    require(
-        prod(variable.shape) <= max_scalars,
-        argument,
-        expected=f"arrays of at most {max_scalars} numbers",
-        got=f"{variable.name!r} of shape {variable.shape}",
-        remedy="export the FMU with smaller arrays",
-    )
+    fits = prod(variable.shape) <= max_scalars
+    expected = f"arrays of at most {max_scalars} numbers"
+    got = f"{variable.name!r} of shape {variable.shape}"
+    require(fits, argument, expected=expected, got=got, remedy="export the FMU with smaller arrays")
     for place, index in enumerate(np.ndindex(variable.shape)):
         yield Scalar(f"{variable.name}[{','.join(map(str, index))}]", variable, place)
 
@@ -356,13 +351,9 @@ def start_column(
 
     """
     able = {each: v for each, v in _settable(description).items() if each not in inputs}
-    require(
-        name in able,
-        "start",
-        expected="scalar variables that can be set before a run, and are no commands",
-        got=repr(name),
-        remedy=_close_matches(name, able),
-    )
+    expected = "scalar variables that can be set before a run, and are no commands"
+    remedy = _close_matches(name, able)
+    require(name in able, "start", expected=expected, got=repr(name), remedy=remedy)
     kind = able[name].type
     array = np.asarray(value)
     fits = array.shape in ((), (count,)) and array.dtype.kind in (

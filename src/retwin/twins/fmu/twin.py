@@ -115,13 +115,11 @@ class FMUTwin:
         sample_rate("rate", self.rate)
         positive("timeout", self.timeout, unit="s")
         for name, rate in self.rates.items():
-            require(
-                name in self.inputs.names and 0 < rate <= self.rate,
-                "rates",
-                expected=f"inputs of the twin, each with a rate above 0 and up to {self.rate:g} Hz",
-                got=f"{name!r} with {rate:g} Hz",
-                remedy=f"the inputs are {', '.join(self.inputs.names)}",
-            )
+            fits = name in self.inputs.names and 0 < rate <= self.rate
+            expected = f"inputs of the twin, each with a rate above 0 and up to {self.rate:g} Hz"
+            got = f"{name!r} with {rate:g} Hz"
+            remedy = f"the inputs are {', '.join(self.inputs.names)}"
+            require(fits, "rates", expected=expected, got=got, remedy=remedy)
         _ = self.substeps
 
     @classmethod
@@ -345,13 +343,10 @@ class FMUTwin:
         """Refuse an FMU that cannot be loaded, once instead of in every run."""
         loading = pool.schedule(f"{TASKS}:load", None, timeout=self.timeout, size=0)
         reason = self._outcome(loading).reason
-        require(
-            not reason,
-            "path",
-            expected="an FMU that loads on this machine",
-            got=f"{self.path.name}: {reason}",
-            remedy="export it for this system; see that what it needs is installed",
-        )
+        expected = "an FMU that loads on this machine"
+        got = f"{self.path.name}: {reason}"
+        remedy = "export it for this system; see that what it needs is installed"
+        require(not reason, "path", expected=expected, got=got, remedy=remedy)
 
     def _start_values(
         self, description: Any, parameters: Mapping[str, ArrayLike], count: int

@@ -128,12 +128,10 @@ def compiled(
             raise
         flag = ", or --no-meshes" if meshes else ""
         missing = "meshes that are not there can be left out" if meshes else "or load its meshes"
-        raise InputError(
-            "model",
-            expected="an MJCF or URDF file that MuJoCo can compile",
-            got=f"{path} ({' '.join(str(error).split())})",
-            remedy=f"repair the file, {missing} (meshes={not meshes}{flag})",
-        ) from None
+        expected = "an MJCF or URDF file that MuJoCo can compile"
+        got = f"{path} ({' '.join(str(error).split())})"
+        remedy = f"repair the file, {missing} (meshes={not meshes}{flag})"
+        raise InputError("model", expected=expected, got=got, remedy=remedy) from None
 
 
 def _name_actuators(spec: mujoco.MjSpec) -> None:
@@ -161,13 +159,10 @@ def _add_sensors(spec: mujoco.MjSpec, places: Sequence[str]) -> None:
         what, sensor = PLACES[found]
         if what == "joints":
             joint = named[what][name]
-            require(
-                joint.type != mujoco.mjtJoint.mjJNT_FREE,
-                "outputs",
-                expected="a joint that is no free joint",
-                got=repr(place),
-                remedy=f"name the body that it moves, body:{joint.parent.name}",
-            )
+            fits = joint.type != mujoco.mjtJoint.mjJNT_FREE
+            expected = "a joint that is no free joint"
+            remedy = f"name the body that it moves, body:{joint.parent.name}"
+            require(fits, "outputs", expected=expected, got=repr(place), remedy=remedy)
             sensor = OF_BALLS[sensor] if joint.type == mujoco.mjtJoint.mjJNT_BALL else sensor
         spec.add_sensor(name=place, type=sensor, objtype=OBJECTS[what], objname=name)
 
@@ -195,23 +190,16 @@ def input_channels(model: mujoco.MjModel, names: Sequence[str]) -> Channels:
     """
     existing = [name for i in range(model.nactuator) if (name := model.actuator(i).name)]
     chosen = [_name("inputs", name, existing) for name in names] or existing
-    require(
-        chosen,
-        "inputs",
-        expected="a model with actuators",
-        got="one without, as a URDF file always is",
-        remedy="add servos=[(joint, Servo(stiffness, damping)), …], in a case.toml a table "
-        "servos, or on the command line --servo JOINT=STIFFNESS,DAMPING for each joint",
-    )
+    got = "one without, as a URDF file always is"
+    remedy = "add servos=[(joint, Servo(stiffness, damping)), …], in a case.toml a table "
+    remedy += "servos, or on the command line --servo JOINT=STIFFNESS,DAMPING for each joint"
+    require(chosen, "inputs", expected="a model with actuators", got=got, remedy=remedy)
     for name in chosen:
         controls = model.actuator_ctrlnum[model.actuator(name).id]
-        require(
-            controls == 1,
-            "inputs",
-            expected="actuators with one control",
-            got=f"{name} with {controls}",
-            remedy="use an actuator for each of its controls",
-        )
+        expected = "actuators with one control"
+        got = f"{name} with {controls}"
+        remedy = "use an actuator for each of its controls"
+        require(controls == 1, "inputs", expected=expected, got=got, remedy=remedy)
     return Channels(tuple(chosen), tuple(control_unit(model, name) for name in chosen))
 
 
@@ -248,14 +236,11 @@ def output_channels(
     for name in names:
         _name("outputs", name, existing, [*existing, *places])
     chosen = list(names) or existing
-    require(
-        chosen,
-        "outputs",
-        expected="sensors, joints, sites or bodies of the model",
-        got="no names, and no sensors with names in the model",
-        remedy="name what is measured: joint:NAME, joint_velocity:NAME, or the position of "
-        f"site:NAME or body:NAME; there are {', '.join(places[:12])}",
-    )
+    expected = "sensors, joints, sites or bodies of the model"
+    got = "no names, and no sensors with names in the model"
+    remedy = "name what is measured: joint:NAME, joint_velocity:NAME, or the position of "
+    remedy += f"site:NAME or body:NAME; there are {', '.join(places[:12])}"
+    require(chosen, "outputs", expected=expected, got=got, remedy=remedy)
     channels: list[str] = []
     units: list[str] = []
     for name in chosen:
@@ -274,13 +259,9 @@ def _name(argument: str, name: str, existing: Sequence[str], also: Sequence[str]
     near = get_close_matches(name, bare, n=1) or get_close_matches(name.rpartition(":")[2], bare, 1)
     close = [bare[each] for each in near]
     shown = ", ".join(known[:12]) + (", …" if len(known) > 12 else "")
-    require(
-        name in existing,
-        argument,
-        expected=f"names in the model: {shown or 'it has none'}",
-        got=repr(name),
-        remedy=f"did you mean {close[0]!r}?" if close else "check the spelling",
-    )
+    expected = f"names in the model: {shown or 'it has none'}"
+    remedy = f"did you mean {close[0]!r}?" if close else "check the spelling"
+    require(name in existing, argument, expected=expected, got=repr(name), remedy=remedy)
     return name
 
 

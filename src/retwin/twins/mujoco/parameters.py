@@ -100,12 +100,10 @@ def _parts(name: str) -> Iterator[tuple[re.Match[str], int]]:
     except InputError:
         raise
     except (KeyError, AttributeError, ValueError, IndexError, TypeError) as error:
-        raise InputError(
-            "parameters",
-            expected='"KIND.NAME.FIELD[INDEX]" as in "joint.hip.damping", or "opt.FIELD[INDEX]"',
-            got=f"{name!r} ({' '.join(str(error.args[0]).split())})",
-            remedy="name a body, joint, actuator, … of the model and one of its number fields",
-        ) from None
+        expected = '"KIND.NAME.FIELD[INDEX]" as in "joint.hip.damping", or "opt.FIELD[INDEX]"'
+        got = f"{name!r} ({' '.join(str(error.args[0]).split())})"
+        remedy = "name a body, joint, actuator, … of the model and one of its number fields"
+        raise InputError("parameters", expected=expected, got=got, remedy=remedy) from None
 
 
 def set_parameter(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None:
@@ -128,13 +126,11 @@ def set_parameter(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None
 
     """
     with _parts(name) as (parts, index):
-        require(
-            parts["option"] not in SHARED_OPTIONS,
-            "parameters",
-            expected="numbers that may differ between simulations",
-            got=f"{name!r}, which they share",
-            remedy="set it in the model, or give the twin another step",
-        )
+        fits = parts["option"] not in SHARED_OPTIONS
+        expected = "numbers that may differ between simulations"
+        got = f"{name!r}, which they share"
+        remedy = "set it in the model, or give the twin another step"
+        require(fits, "parameters", expected=expected, got=got, remedy=remedy)
         if parts["option"]:
             field = batch.expand(f"opt.{parts['option']}")
             field.reshape(len(values), -1)[:, index] = values

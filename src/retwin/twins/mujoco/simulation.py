@@ -123,7 +123,7 @@ class MuJoCoSimulation:
             batch.reset(keyframe=self.keyframe)
             controls = self._controls(batch, commands)
             self._rest(batch, controls[:, :1], commands[:, 0])
-            recorded = self._roll(batch, controls, frozen, steps, fields)
+            recorded = self._roll(batch, controls, frozen, fields)
         failed = {}
         for i in np.flatnonzero(batch.warning[:, :, 1].any(axis=1)):
             kind = int(np.argmax(batch.warning[i, :, 1] > 0))
@@ -133,15 +133,11 @@ class MuJoCoSimulation:
         return Response(recorded["sensordata"], positions, velocities, failed)
 
     def _roll(
-        self,
-        batch: mujoco_batch.Batch,
-        controls: NDArray,
-        frozen: NDArray,
-        steps: int,
-        fields: Sequence[str],
+        self, batch: mujoco_batch.Batch, controls: NDArray, frozen: NDArray, fields: Sequence[str]
     ) -> dict[str, NDArray]:
         """Fields at every sample, (n, T, size); joints are locked at their onsets."""
         sub, last = self.substeps, controls.shape[1]
+        steps = (last - 1) // sub + 1
         columns = {name: self._columns if name == "sensordata" else slice(None) for name in fields}
         recorded = {}
         for name, width in columns.items():

@@ -52,13 +52,10 @@ class NoisyTwin(ChunkedTwin, TwinWrapper):
 
     def __post_init__(self) -> None:
         scale, width = np.asarray(self.scale, dtype=float), len(self.twin.outputs)
-        require(
-            scale.shape == (width,) and bool((np.isfinite(scale) & (scale >= 0)).all()),
-            "scale",
-            expected=f"{width} finite numbers of at least 0, one per output",
-            got=scale.tolist(),
-            remedy="estimate it by residual_scale(calibration trajectories)",
-        )
+        fits = scale.shape == (width,) and bool((np.isfinite(scale) & (scale >= 0)).all())
+        expected = f"{width} finite numbers of at least 0, one per output"
+        remedy = "estimate it by residual_scale(calibration trajectories)"
+        require(fits, "scale", expected=expected, got=scale.tolist(), remedy=remedy)
         object.__setattr__(self, "scale", scale)
         stride_of(self.rate, self.sensor_rate, argument="sensor_rate")
 
@@ -93,13 +90,10 @@ def residual_scale(calibration: Trajectories) -> NDArray:
 
     """
     check_healthy("calibration", calibration)
-    require(
-        calibration.mask.any(axis=(0, 1)).all(),
-        "calibration",
-        expected="every output measured somewhere",
-        got="one that never was",
-        remedy="give trajectories in which it is, or leave the output out",
-    )
+    fits = calibration.mask.any(axis=(0, 1)).all()
+    expected = "every output measured somewhere"
+    remedy = "give trajectories in which it is, or leave the output out"
+    require(fits, "calibration", expected=expected, got="one that never was", remedy=remedy)
     residual = calibration.residual.astype(np.float64)
     return residual.std(axis=(0, 1), where=calibration.mask)
 

@@ -50,13 +50,10 @@ def values_per_simulation(
         array = np.asarray(given)
         shape = f"{array.dtype} of shape {array.shape}" if array.ndim else repr(array.item())
         numbers = array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
-        require(
-            numbers and array.shape in ((), (count,)),
-            "parameters",
-            expected=f"finite numbers: one for all, or one per trajectory, {count}",
-            got=f"{name}: {shape}",
-            remedy="give as many values as there are trajectories",
-        )
+        fits = numbers and array.shape in ((), (count,))
+        expected = f"finite numbers: one for all, or one per trajectory, {count}"
+        remedy = "give as many values as there are trajectories"
+        require(fits, "parameters", expected=expected, got=f"{name}: {shape}", remedy=remedy)
         values[name] = np.broadcast_to(array.astype(float), count)
     return values
 
@@ -122,13 +119,10 @@ class RebuiltTwin(AdjustableTwin, TwinWrapper):
 
         """
         made = self.build(dict(self.defaults))
-        require(
-            isinstance(made, Twin),
-            "build",
-            expected="a function that returns a twin",
-            got=type(made).__name__,
-            remedy="return a FunctionTwin, or any object that satisfies Twin",
-        )
+        fits = isinstance(made, Twin)
+        expected = "a function that returns a twin"
+        remedy = "return a FunctionTwin, or any object that satisfies Twin"
+        require(fits, "build", expected=expected, got=type(made).__name__, remedy=remedy)
         return made
 
     @property

@@ -100,20 +100,16 @@ class Parameter:
 
     def __post_init__(self) -> None:
         start = (self.low + self.high) / 2 if self.start is None else self.start
-        require(
-            np.isfinite([self.low, self.high]).all() and self.low < self.high,
-            f"parameter {self.name!r}",
-            expected="finite bounds, low below high",
-            got=f"low {self.low}, high {self.high}",
-            remedy=f"give the plausible range in {self.unit}",
-        )
-        require(
-            self.low <= start <= self.high,
-            f"parameter {self.name!r}",
-            expected=f"a start from {self.low:g} to {self.high:g} {self.unit}",
-            got=f"{start:g}",
-            remedy="widen the bounds or leave start out",
-        )
+        fits = np.isfinite([self.low, self.high]).all() and self.low < self.high
+        expected = "finite bounds, low below high"
+        got = f"low {self.low}, high {self.high}"
+        remedy = f"give the plausible range in {self.unit}"
+        require(fits, f"parameter {self.name!r}", expected=expected, got=got, remedy=remedy)
+        fits = self.low <= start <= self.high
+        expected = f"a start from {self.low:g} to {self.high:g} {self.unit}"
+        got = f"{start:g}"
+        remedy = "widen the bounds or leave start out"
+        require(fits, f"parameter {self.name!r}", expected=expected, got=got, remedy=remedy)
         object.__setattr__(self, "start", float(start))
         object.__setattr__(self, "places", dict(self.places or {self.name: 1.0}))
 
@@ -151,30 +147,21 @@ class ParametricTwin(TwinWrapper):
     held: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require(
-            takes_parameters(self.twin),
-            "twin",
-            expected="one whose simulate takes values of its parameters",
-            got=type(self.twin).__name__,
-            remedy="give ParametricTwin.built a function from values by name to a twin",
-        )
+        fits = takes_parameters(self.twin)
+        expected = "one whose simulate takes values of its parameters"
+        remedy = "give ParametricTwin.built a function from values by name to a twin"
+        require(fits, "twin", expected=expected, got=type(self.twin).__name__, remedy=remedy)
         names = [each.name for each in self.parameters]
-        require(
-            names and len(set(names)) == len(names),
-            "parameters",
-            expected="at least one, no name twice",
-            got=names,
-            remedy="give each parameter a name of its own",
-        )
+        fits = 0 < len(names) == len(set(names))
+        expected = "at least one, no name twice"
+        remedy = "give each parameter a name of its own"
+        require(fits, "parameters", expected=expected, got=names, remedy=remedy)
         starts = tuple(float(each.start or 0.0) for each in self.parameters)
         values = tuple(map(float, self.values)) or starts
-        require(
-            len(values) == len(names) and np.isfinite(values).all(),
-            "values",
-            expected=f"{len(names)} finite numbers, one per parameter",
-            got=values,
-            remedy=f"the parameters are {', '.join(names)}",
-        )
+        fits = len(values) == len(names) and bool(np.isfinite(values).all())
+        expected = f"{len(names)} finite numbers, one per parameter"
+        remedy = f"the parameters are {', '.join(names)}"
+        require(fits, "values", expected=expected, got=values, remedy=remedy)
         object.__setattr__(self, "parameters", tuple(self.parameters))
         object.__setattr__(self, "values", values)
 

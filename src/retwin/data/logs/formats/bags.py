@@ -70,9 +70,6 @@ def _check_database(path: Path) -> None:
         if kind not in ("table", "index") or re.search(r"\b(virtual|generated)\b|\bas\b", sql, re.I)
     ]
     if bad:
-        raise InputError(
-            path.name,
-            expected="tables of a ROS 2 bag",
-            got=f"a {bad[0]} that computes what it holds",
-            remedy="the file is damaged, or was made to do harm",
-        )
+        got = f"a {bad[0]} that computes what it holds"
+        remedy = "the file is damaged, or was made to do harm"
+        raise InputError(path.name, expected="tables of a ROS 2 bag", got=got, remedy=remedy)

@@ -41,12 +41,10 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
                     decode = partial(_decode, types, schema, channel, message.data)
                     series.add(channel.topic, str(channel.id), message.log_time, decode)
         except (exceptions.EndOfFile, struct.error):
-            raise InputError(
-                path.name,
-                expected="an MCAP file that is whole",
-                got="one that is cut off",
-                remedy=f"recover it: mcap recover {path.name} -o recovered.mcap",
-            ) from None
+            expected = "an MCAP file that is whole"
+            got = "one that is cut off"
+            remedy = f"recover it: mcap recover {path.name} -o recovered.mcap"
+            raise InputError(path.name, expected=expected, got=got, remedy=remedy) from None
     yield from series.found()
 
 

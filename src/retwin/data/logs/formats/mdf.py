@@ -55,12 +55,9 @@ def _signal(
     found = file.get(group=group, index=index, ignore_invalidation_bits=True)
     declared = int(file.groups[group].channel_group.cycles_nr)
     if len(found.samples) < declared:
-        raise InputError(
-            path.name,
-            expected=f"{declared} samples of {title!r}, as it declares",
-            got=str(len(found.samples)),
-            remedy="the file is cut off: get or make it again",
-        )
+        expected = f"{declared} samples of {title!r}, as it declares"
+        remedy = "the file is cut off: get or make it again"
+        raise InputError(path.name, expected=expected, got=str(len(found.samples)), remedy=remedy)
     if found.samples.ndim != 1 or found.samples.dtype.kind not in "iufb":
         return Skipped(title, "text or arrays")
     values = found.samples.astype(float)

@@ -62,12 +62,9 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
 def _check_whole(path: Path, file: Any) -> None:
     status = getattr(file, "file_status", None)
     if status is not None and status.incomplete_final_segment:
-        raise InputError(
-            path.name,
-            expected="a TDMS file that is whole",
-            got="a last segment that is cut off",
-            remedy="copy the file again, or repair it in LabVIEW",
-        )
+        got = "a last segment that is cut off"
+        remedy = "copy the file again, or repair it in LabVIEW"
+        raise InputError(path.name, expected="a TDMS file that is whole", got=got, remedy=remedy)
 
 
 def _unit(channel: Any) -> str:
@@ -99,9 +96,7 @@ def _group_times(path: Path, channel: Any, group: str, count: int, clock: Clock)
         return row_times(np.asarray(channel[:]), unit, clock, where)
     if clock.rate:
         return even_times(count, clock.rate, path.name)
-    raise InputError(
-        path.name,
-        expected=f"times of the {count} samples of group {group!r}",
-        got="neither waveform properties nor a channel of times of that length",
-        remedy="name it in the mapping: [time] column = …, or give the samples per s: rate = …",
-    )
+    expected = f"times of the {count} samples of group {group!r}"
+    got = "neither waveform properties nor a channel of times of that length"
+    remedy = "name it in the mapping: [time] column = …, or give the samples per s: rate = …"
+    raise InputError(path.name, expected=expected, got=got, remedy=remedy)
