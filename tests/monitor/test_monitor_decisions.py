@@ -722,6 +722,7 @@ def test_a_fault_as_large_as_what_it_changes_is_no_better_than_hidden(
     found = Visible("leak", size, 0.1, 1.0, 5.0, "1/s", 0.05)
     assert found.hidden is hidden
     assert ("98% of the value" in str(found)) is (size == 0.049)
+    assert "0.1 1/s, 0.042% of the value" in str(replace(found, size=0.1, value=240.0))
 
 
 # The page.
