@@ -16,6 +16,7 @@ from retwin.cases.matching import CONSTANT
 from retwin.evaluation import hold_out, validate_identification
 from retwin.evaluation.identification.parameters import estimates
 from retwin.report.identification.texts import findings, interval_remark, state
+from retwin.twins import State, StateTwin
 from retwin.update.identification import MCMC, LeastSquares, Noise
 
 LEAK, GAIN = 0.1, 0.5
@@ -123,6 +124,31 @@ def test_records_that_begin_in_another_state_are_named() -> None:
         found = checked(data.replace(observed=observed), "gain")
         assert (found.begin_errors["y"] > 2) == named
         assert any("did not begin in the state" in each for each in findings(found)) == named
+
+
+@pytest.mark.parametrize("states", [False, True])
+def test_a_horizon_is_advised_where_it_can_be_given(*, states: bool) -> None:
+    """Outputs of the other sign are predicted worse than by their mean."""
+    data, twin = measured(4, count=4), twin_with("gain")
+    data = data.replace(observed=-data.observed)
+    if states:
+        level = (State("level", "m", 0.0),)
+        equations = StateTwin(
+            level,
+            lambda x, u, p: x.level,
+            twin.inputs,
+            twin.outputs,
+            1.0,
+            derivative=lambda x, u, p: (p.gain * u.u - LEAK * x.level,),
+            parameters=[rt.Parameter("gain", "1", 0.1, 1.0, 0.3)],
+        )
+        twin = rt.ParametricTwin(equations, equations.parameters)
+    with pytest.warns(UserWarning, match="at a bound: gain"):
+        found = rt.identify(twin, data, LeastSquares(starts=1), seed=0, horizon=np.inf)
+    said = " ".join(findings(validate_identification(found, twin, data)))
+    assert "worse than the record's mean" in said
+    assert ("such as --horizon 30s" in said) is states
+    assert ("--horizon" in said) is states
 
 
 def test_a_parameter_without_effect_is_an_open_direction() -> None:

@@ -12,6 +12,7 @@ import pytest
 from leaking_tank import TANK, recorded
 
 import retwin as rt
+from retwin.cli.monitor import _rates
 from retwin.errors import InputError
 from retwin.monitor.detect.detector import DetectorState
 from retwin.monitor.detect.events import CHANGED, FOLLOWS, Course
@@ -722,6 +723,24 @@ def test_a_fault_as_large_as_what_it_changes_is_no_better_than_hidden(
     found = Visible("leak", size, 0.1, 1.0, 5.0, "1/s", 0.05)
     assert found.hidden is hidden
     assert ("98% of the value" in str(found)) is (size == 0.049)
+    assert "0.1 1/s, 0.042% of the value" in str(replace(found, size=0.1, value=240.0))
+
+
+def test_a_replay_without_events_names_what_is_seen_only_where_it_is_large(
+    monitor: Monitor,
+) -> None:
+    small = Visible("level: sensor offset", 0.49, 1.0, 1.0, 5.0, "m", 1.0, "range")
+    faults = {"leak changed": 0.5, "pump: another effect": 1.53}
+    some = [replace(small, fault=name, size=size) for name, size in faults.items()]
+    unseen = Visible("leak drifting", None, 1.0, 0.1, 5.0)
+    made = replace(monitor, visible=(small, *some, unseen))
+    data = recorded(2)
+    text = _rates(made, [(data, SimpleNamespace(events=[]))])  # type: ignore[list-item]
+    assert "Not seen: leak drifting." in text
+    assert text.endswith(
+        "Seen only from 50% of the parameter, command or output range on: leak changed (50%), "
+        "pump: another effect (153%)."
+    )
 
 
 # The page.

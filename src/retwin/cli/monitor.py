@@ -61,6 +61,10 @@ EQUATIONS = (
 """What would watch the twin itself, where a black box takes its place."""
 FEW = 6
 """Faults that are listed, at most."""
+LARGE = 0.5
+"""Share of what a fault changes from which on the size from which it is seen is large."""
+ONLY_LARGE = f"Seen only from {LARGE:.0%} of the parameter, command or output range on"
+"""What is said of those."""
 EARLIER = "before, by fewer samples: "
 """What stands before a cause in whose place another one was named later."""
 EXTRAPOLATED = "if it is a fault, and the twin holds there: "
@@ -627,11 +631,11 @@ def _rates(monitor: Monitor, found: Sequence[tuple[Trajectories, Watched]]) -> s
     if not events:
         text += f", which alone bounds their rate at one in {bound} (exact 95 %), if it was healthy"
     text += f". {_describe_promise(monitor)}"
-    hidden = [each for each in monitor.visible if each.hidden]
-    if hidden and not events:
-        unseen = [each.fault for each in hidden if each.share < SHARE]
-        large = [f"{each.fault} ({each.shown_size})" for each in hidden if each.share >= SHARE]
-        for kind, names in (("Not seen", unseen), ("Seen only where it is large", large)):
+    if not events:
+        seen = [each for each in monitor.visible if each.share >= SHARE]
+        unseen = [each.fault for each in monitor.visible if each.share < SHARE]
+        large = [f"{e.fault} ({e.relative:.0%})" for e in seen if e.relative >= LARGE]
+        for kind, names in (("Not seen", unseen), (ONLY_LARGE, large)):
             others = " and others" * (len(names) > FEW)
             text += f" {kind}: {', '.join(names[:FEW])}{others}." if names else ""
     if events and poisson.sf(events - 1, samples / monitor.run_length) < monitor.alpha:

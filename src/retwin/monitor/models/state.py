@@ -312,26 +312,24 @@ class Visible:
     compared: str = "value"
 
     @property
+    def relative(self) -> float:
+        """The size from which on it is seen over what it is compared with; 0 without either."""
+        return abs(self.size / self.value) if self.size and self.value else 0.0
+
+    @property
     def hidden(self) -> bool:
         """Whether it is not seen, or only where it is as large as what it changes."""
-        if self.value is None or self.size is None:
-            return self.share < SHARE
-        return self.share < SHARE or abs(self.size) >= abs(self.value)
+        return self.share < SHARE or self.relative >= 1
 
     def _with_unit(self, size: float) -> str:
         return f"{abs(size):.3g}" + (f" {self.unit}" if self.unit not in ("", "1") else "")
 
-    @property
-    def shown_size(self) -> str:
-        """The size from which on it is seen, with its unit and as a share of what it changes."""
-        text = self._with_unit(self.size or 0.0)
-        if self.size is not None and self.value and self.value != 1:
-            text += f", {abs(self.size / self.value):.0%} of the {self.compared}"
-        return text
-
     def __str__(self) -> str:
         """One line for the terminal."""
-        what = "seen" if self.size is None else f"seen from a size of {self.shown_size}"
+        what = "seen" if self.size is None else f"seen from a size of {self._with_unit(self.size)}"
+        percent = 100 * self.relative
+        if percent and self.value != 1:
+            what += f", {percent:{'.0f' if percent >= 1 else '.2g'}}% of the {self.compared}"
         if self.share < SHARE:
             up_to = "" if self.largest is None else f" up to {self._with_unit(self.largest)}"
             what = f"not seen{up_to}"
