@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import quad
+from scipy.stats import halfnorm, invgamma
 from torch import Tensor
 
-from retwin.inference.hierarchy import CONDITION, Design, Hierarchy, Likelihood
+from retwin.inference.hierarchy import CONDITION, TIED, Design, Hierarchy, Likelihood, _level
 from retwin.inference.hyperprior import Hyperprior
 from retwin.inference.solver import Solution
 
@@ -265,3 +267,33 @@ def test_evidence_is_that_of_the_outputs() -> None:
         log_density = float(density.log_prob(data.measured.flatten()))
         found.append(hierarchy.evidence(data.design, given) - log_density)
     assert abs(found[0] - found[1]) < 1e-6
+
+
+def tied(sizes: list[float]) -> tuple[Design, Tensor]:
+    """Groups of unit 1 that are tied, and their variances."""
+    count = len(sizes)
+    design = replace(drawn(1, seed=0).design, tied=(0, count), unit=torch.ones(count).double())
+    return design, torch.tensor(sizes, dtype=torch.float64).square()
+
+
+@pytest.mark.parametrize("sizes", [[0.5, 0.6, 0.5, 0.55], [0.15, 1.2, 0.3, 0.6]])
+def test_how_alike_tied_groups_are_is_learned(sizes: list[float]) -> None:
+    """The mean of the degrees of freedom is that of numerical integration over the level."""
+    design, variance = tied(sizes)
+
+    def density(freedom: float) -> float:
+        def joint(level: float) -> float:
+            scale = freedom * level**2 / 2
+            each = invgamma.pdf(variance.numpy(), freedom / 2, scale=scale)
+            return float(halfnorm.pdf(level) * np.prod(each))
+
+        return quad(joint, 0.0, 10.0, points=[0.3, 0.6, 1.2], limit=200)[0]
+
+    weight = np.array([density(each) for each in TIED])
+    expected = np.exp(weight @ np.log(TIED) / weight.sum())
+    assert _level(design, variance)[1] == pytest.approx(expected, rel=1e-6)
+
+
+def test_groups_of_one_size_are_tied_more_closely_than_others() -> None:
+    alike, unlike = (_level(*tied(each))[1] for each in ([0.5] * 4, [0.1, 0.3, 0.9, 2.7]))
+    assert alike > 3 * unlike

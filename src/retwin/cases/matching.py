@@ -78,8 +78,8 @@ def match_twin(
         else "rename the tables of the mapping, or have it proposed for the twin: retwin data map "
         "LOG --case plant.fmu",
     )
-    taken = _units_taken(found.inputs, twin.inputs, inputs)
-    taken += _units_taken(found.outputs, twin.outputs, outputs)
+    taken = _describe_units(found.inputs, twin.inputs, inputs)
+    taken += _describe_units(found.outputs, twin.outputs, outputs)
     if taken:
         text = f"the twin states no units of {', '.join(taken)}: taken as those of the log"
         text += ", so that 100 % is 100 and not 1" * any("(%)" in each for each in taken)
@@ -139,7 +139,7 @@ def _columns(
     return made
 
 
-def _units_taken(own: Channels, wanted: Channels, places: Places) -> list[str]:
+def _describe_units(own: Channels, wanted: Channels, places: Places) -> list[str]:
     """Channels of a twin without a unit, with the unit that the log has."""
     channels = zip(wanted.names, wanted.units, places, strict=True)
     return [

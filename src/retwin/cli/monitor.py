@@ -64,7 +64,7 @@ FEW = 6
 LARGE = 0.5
 """Share of what a fault changes from which on the size from which it is seen is large."""
 ONLY_LARGE = f"Seen only from {LARGE:.0%} of the parameter, command or output range on"
-"""What is said of those."""
+"""How causes are introduced that are seen only from such a size on."""
 EARLIER = "before, by fewer samples: "
 """What stands before a cause in whose place another one was named later."""
 EXTRAPOLATED = "if it is a fault, and the twin holds there: "

@@ -31,8 +31,8 @@ FREEDOM = 2.0
 """Degrees of freedom of the scaled inverse chi-squared hyperpriors: what a variance is expected to
 be counts as much as two observations."""
 TIED = FREEDOM * 2.0 ** np.arange(6)
-"""The same for variances of tied groups, which are as probable beforehand: how alike the groups
-are is learned."""
+"""Degrees of freedom between which the data decide for the variances of tied groups, all of them as
+probable beforehand: the more, the more alike these variances are."""
 TOLERANCE = 1e-3
 """Relative change of all variances below which they have converged."""
 MAX_STEPS = 200
@@ -436,8 +436,9 @@ def _level(
 ) -> tuple[float, float]:
     """What variances (G,) of tied groups are expected to be, in squares of their units.
 
-    It is the most probable value, or a draw, with the degrees of freedom. Beforehand its root, a
-    standard deviation, is half-normal with a scale of one unit: any smaller one is as probable.
+    It is the most probable value for the geometric mean of the degrees of freedom, or a draw of
+    both, and comes with these degrees. Beforehand its root, a standard deviation, is half-normal
+    with a scale of one unit: any smaller one is as probable.
     """
     first, last = design.tied
     if first == last:

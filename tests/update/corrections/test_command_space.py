@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from retwin.errors import InputError
 from retwin.serialisation.configs import from_config, to_config
 from retwin.twins.faults.applied_faults import draw_faults, faulty_commands, frozen_from
 from retwin.update.corrections.commands.effective_commands import effective_commands
+from retwin.update.corrections.commands.offset_features import FIRST_OFFSET, OffsetFeatures
 from retwin.update.corrections.commands.problem import CommandProblem
 
 POLL = round(RATE / SENSOR_RATE)
@@ -371,6 +373,31 @@ def test_a_trajectory_without_a_usable_sample_is_named(
     mask[9] = False
     with pytest.raises(InputError, match="trajectories 7, 9; leave them out"):
         rt.CommandSpace().infer(context, context.path.double(), mask)
+
+
+@pytest.mark.parametrize(
+    ("units", "pooled"), [(("deg",) * 4, [0, 1, 2, 3]), (("deg", "m", "deg", "1"), [0, 2])]
+)
+def test_offsets_of_actuators_of_one_unit_are_expected_to_be_alike(
+    exact, commands: np.ndarray, units: tuple[str, ...], pooled: list[int]
+) -> None:
+    """An actuator that a program hardly moves is not expected to be more exact than others."""
+    sent = commands.copy()
+    sent[..., 2] = 500.0 + 0.1 * (sent[..., 2] - 500.0)
+    context = context_of(exact, sent)
+    arm = SimpleNamespace(inputs=rt.Channels(KINEMATIC.inputs.names, units), memoryless=True)
+    problem = CommandProblem.of(
+        context,
+        context.nominal,
+        polled(len(sent)),
+        delay_range=(0.0, 20.0),
+        max_samples=100,
+    )
+    own = OffsetFeatures.of(replace(problem, surrogate=arm))
+    expected = own.spread.clone()
+    expected[pooled] = own.spread[pooled].square().mean().sqrt()
+    assert own.spread[2] < 0.2 * own.spread[1]
+    torch.testing.assert_close(own.unit, FIRST_OFFSET * expected)
 
 
 def test_names_units_and_config() -> None:

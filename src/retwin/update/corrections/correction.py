@@ -24,7 +24,8 @@ class DifferentiableTwin(Protocol):
     """The part of a surrogate that corrections use: a call with gradient, and one without.
 
     Optional attributes are `memoryless`, whether an output depends on the command of its own sample
-    only, and `unit`, (d_y,), by which outputs are divided to be compared with each other.
+    only, `unit`, (d_y,), by which outputs are divided to be compared with each other, and `inputs`,
+    the channels of the commands, whose units say which actuators are of one kind.
     """
 
     def __call__(self, commands: Tensor) -> Tensor:

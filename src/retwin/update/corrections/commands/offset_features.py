@@ -182,11 +182,11 @@ class OffsetFeatures:
 def _pool_alike(spread: Tensor, moved: Tensor, surrogate: DifferentiableTwin) -> Tensor:
     """Root mean square (d_u,) of the spreads of those that moved and have commands of one unit.
 
-    An actuator whose unit is not known is alone.
+    An actuator without a unit ("1") is alone.
     """
     channels = getattr(surrogate, "inputs", None)
-    units = channels.units if channels else [""] * len(spread)
-    alike = torch.tensor([[a == b != "" for b in units] for a in units]) & moved
+    units = channels.units if channels else ["1"] * len(spread)
+    alike = torch.tensor([[a == b != "1" for b in units] for a in units]) & moved
     alone = ~alike.any(dim=1)
     weight = alike.to(spread) + torch.diag(alone.to(spread))
     return (weight @ spread.square() / weight.sum(dim=1)).sqrt()
