@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from scipy.io import savemat
 
 import retwin as rt
+from retwin.evaluation.choice.fitting import JUDGED, UNSTABLE
 
 
 @pytest.mark.slow
@@ -358,3 +360,19 @@ def test_a_built_in_twin_has_its_own_case(call, tmp_path: Path) -> None:
     code, _, err = call("twin", "simulate", "tanks", "--n", 2, "--out", tmp_path / "made.npz")
     assert code == 0, err
     assert rt.load(tmp_path / "made.npz").steps == rt.cases.tanks().sampler.steps
+
+
+def test_a_model_without_free_simulation_says_so_where_it_is_simulated(
+    watched: Path, call, tmp_path: Path
+) -> None:
+    said, model = f"{UNSTABLE} {JUDGED.format(130.0)}", tmp_path / "model"
+    shutil.copytree(watched / "model", model)
+    (model / "choice.json").write_text(json.dumps({"remarks": [said, "Another one."]}))
+    real = watched / "healthy.npz"
+    for how, shown in (((), True), (("--horizon", "5s"), False)):
+        code, printed, err = call("evaluate", model, "--real", real, *how)
+        assert code == 0, err
+        assert (said in " ".join(printed.split())) is shown
+    bands = ("--bands", "--out", tmp_path / "bands.csv")
+    code, _, err = call("generate", model, "--commands", real, *bands)
+    assert (code, said in err) == (0, True), err

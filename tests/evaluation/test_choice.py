@@ -131,6 +131,11 @@ def test_an_unstable_twin_is_judged_over_a_shorter_time_which_is_stated() -> Non
     assert found.horizon is not None
     assert found.horizon < 60
     assert "unstable" in found.remarks[0]
+    assert f"with evaluate{found.option}, and for no free simulation" in found.remarks[0]
+    assert found.option == f" --horizon {found.horizon:g}s"
+    assert replace(found, horizon=None, begin=40.0).option == " --warm-up 40s"
+    assert replace(found, horizon=None).option == ""
+    assert not any("Records begin in different states" in each for each in found.remarks)
     # Its filter does not follow the machine for so long, and that is stated too.
     assert found.score(found.chosen).rmse["heat"] < heat.std() or "Do not use" in found.remarks[1]
 

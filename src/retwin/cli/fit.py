@@ -292,5 +292,5 @@ def _print(found: Fitted, base: StandIn, out: Path, *, as_json: bool) -> None:
     shown += shown_records(found.checked)
     answer(values, *shown, *found.remarks, *model_sentences(found), *failed, as_json=as_json)
     note(f"Saved {out}, with the report {out / 'report.html'}")
-    begin = f" --warm-up {found.begin:g}s" if found.begin else ""
-    note(f"Next, on runs that it has not seen: retwin evaluate {out} --real OTHER_LOG{begin}")
+    command = f"retwin evaluate {out} --real OTHER_LOG{found.option}"
+    note(f"Next, on runs that it has not seen: {command}")

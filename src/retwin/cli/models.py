@@ -32,6 +32,7 @@ from retwin.cli.reading import (
     read_commands,
     source_of,
     system_of,
+    unstable_remarks,
     updated_twin,
 )
 from retwin.cli.terminal import answer, bar, note, table
@@ -75,6 +76,8 @@ def generate(
         got=f"--commands {commands}, --out {out}",
         remedy="bands are those of given commands",
     )
+    for text in unstable_remarks(model):
+        note(text)
     if bands:
         check_place(out)
         check_place(out.with_suffix(".png"))
@@ -170,6 +173,7 @@ def evaluate(
     records = read(real, system, part="test", max_bytes=max_bytes, mapping=mapping)
     if begin:
         _note_start(updated, records, begin)
+    unstable = [] if ahead else unstable_remarks(model)
     scores = score_model(
         updated,
         records,
@@ -195,6 +199,8 @@ def evaluate(
         )
         for each in sorted(scores, key=lambda each: records.outputs.names.index(each.output))
     ]
+    known = ahead or begin or unstable
+    begins = [] if known else _start_remarks(updated, records, scores, units, seed)
     heads = ("output", "who", "RMSE", "CRPS", "90 % band holds", "its width", "unit")
     how = "free simulation" if ahead is None else f"predictions {ahead:g} s ahead"
     count = f"{len(records)} record{'s' if len(records) > 1 else ''}"
@@ -202,9 +208,10 @@ def evaluate(
         {"scores": [asdict(each) for each in scores], "records": len(records)},
         f"{count}, {how}:",
         table(heads, rows, numbers=heads[2:6]),
+        *unstable,
         *_verdict(scores, started=bool(begin)),
         *fitted_remarks(model, records, "these are no scores of new ones"),
-        *([] if ahead or begin else _start_remarks(updated, records, scores, units, seed)),
+        *begins,
         as_json=as_json,
     )
     if out is not None:

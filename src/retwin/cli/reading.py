@@ -243,16 +243,29 @@ def shown_records(checked: Checked) -> list[RenderableType]:
     return shown
 
 
+def _read_choice(model: Path | None) -> dict[str, Any]:
+    """What `rt.fit` wrote beside a model about how it was chosen; nothing of another one."""
+    from retwin.evaluation.choice.fitted import FILE
+
+    file = model / FILE if model else None
+    return read_json(file) if file and file.is_file() else {}
+
+
+def unstable_remarks(model: Path) -> list[str]:
+    """What `rt.fit` said where it found that free simulations of a model are of no use."""
+    from retwin.evaluation.choice.fitting import UNSTABLE
+
+    return [each for each in _read_choice(model).get("remarks", []) if each.startswith(UNSTABLE)]
+
+
 def fitted_remarks(model: Path | None, records: Trajectories, therefore: str) -> list[str]:
     """Which records a model was fitted to, and what follows from that; none where it is not known.
 
     `rt.fit` writes their fingerprints beside the model.
     """
     from retwin.data.quality.copies import fingerprints
-    from retwin.evaluation.choice.fitted import FILE
 
-    file = model / FILE if model else None
-    known = read_json(file).get("fitted_to", []) if file and file.is_file() else []
+    known = _read_choice(model).get("fitted_to", [])
     own = sum(each in known for each in fingerprints(records)) if known else 0
     if not own:
         return []

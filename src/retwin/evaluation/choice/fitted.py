@@ -131,6 +131,13 @@ class Fitted:
         return "free simulation from the commands"
 
     @property
+    def option(self) -> str:
+        """The option of `retwin evaluate` by which other records are predicted as these were."""
+        if self.horizon is not None:
+            return f" --horizon {self.horizon:g}s"
+        return f" --warm-up {self.begin:g}s" if self.begin else ""
+
+    @property
     def values(self) -> dict[str, Any]:
         """The comparison as JSON values."""
         scores = [

@@ -59,10 +59,16 @@ from retwin.workers.threads import one_thread
 
 UNSTABLE = (
     "Free simulation from the commands alone diverges, or is no better than the mean of the "
-    "outputs: the twin integrates, or is unstable. Candidates were judged {:.3g} s after the last "
-    "measurement instead. Use no free simulation of this model."
+    "outputs: the twin integrates, or is unstable."
 )
 """What is said where candidates were judged over a shorter time than was asked for."""
+
+JUDGED = (
+    "Candidates were judged {0:g} s after the last measurement instead. Use the model so, with "
+    "evaluate --horizon {0:g}s, and for no free simulation: neither generate, nor evaluate without "
+    "--horizon."
+)
+"""How the model is used then."""
 
 NOT_TAKEN = (
     "The method that was asked for ({}) predicts left-out parts of the records clearly worse than: "
@@ -168,7 +174,8 @@ def fit(
         titles = (CANDIDATES[each] for each in (wanted, chosen))
         remarks = (NOT_TAKEN.format(*titles), *remarks)
     if horizon != settings.horizon:
-        remarks = (UNSTABLE.format(horizon), *remarks)
+        remarks = (f"{UNSTABLE} {JUDGED.format(horizon)}", *remarks)
+    begins = start_remarks(records, model.forecast, begin) if horizon is None else []
     predicted, deviation = _predictions_of(comparison, chosen)
     parameters = _parameters(whole, model)
     found = Fitted(
@@ -178,7 +185,7 @@ def fit(
         scores=scores,
         remarks=(
             *remarks,
-            *(start_remarks(records, model.forecast, begin) or correction_remarks(scores, chosen)),
+            *(begins or correction_remarks(scores, chosen)),
             *_at_bounds(whole, parameters),
             *_of_prior(model, others),
         ),
