@@ -569,8 +569,8 @@ def test_a_sample_that_predicts_better_is_named_as_what_it_is(
     ("coverage", "interval", "text"),
     [
         (0.9, None, ""),
-        (0.84, None, "fewer than five records cannot tell"),
-        (0.84, (0.7, 0.92), "these records cannot tell"),
+        (0.84, None, "in the worst. Fewer than five records cannot show"),
+        (0.84, (0.7, 0.92), "in the worst. Records that differ so much cannot show"),
         (0.84, (0.7, 0.88), "do not rely on it here"),
         (0.7, (0.6, 0.84), "do not rely on it here"),
     ],
@@ -578,10 +578,18 @@ def test_a_sample_that_predicts_better_is_named_as_what_it_is(
 def test_a_band_that_holds_too_little_is_said_with_how_sure_that_is(
     coverage: float, interval: tuple[float, float] | None, text: str
 ) -> None:
-    model = ModelScore("model", "y", None, 0.4, 0.3, coverage, 1.0, interval)
+    shares = (0.69, 0.9, 0.79, 0.85, 0.97)
+    model = ModelScore("model", "y", None, 0.4, 0.3, coverage, 1.0, interval, shares)
     found = _verdict([model, ModelScore("mean", "y", None, 2.0, 2.0, *2 * [float("nan")])])
     assert len(found) == bool(text)
     assert text in " ".join(found)
+    assert ("under 90% in 3 of 5 records, 69% in the worst" in " ".join(found)) is (
+        "cannot show" in text
+    )
+    some = replace(model, coverage=0.84, interval=None, shares=(None, 0.8, 0.7))
+    assert (
+        "under 90% in 2 of 2 records, 70% in the worst. 1 more had no band" in _verdict([some])[0]
+    )
     (other,) = _verdict([replace(model, rmse=4.0, coverage=0.4)], started=True)
     assert "holds 40% of these samples, and the RMSE is 13 times" in other
     assert "--warm-up" not in other
@@ -605,6 +613,7 @@ def test_the_coverage_of_five_records_has_an_interval_that_contains_it() -> None
     for runs in ((5, 6, 7, 8), (5, 6, 7, 8, 9)):
         (row, *_) = rt.score_model(found.twin, records(*runs, slope=right))
         assert (row.interval is None) == (len(runs) < 5)
+        assert np.mean(row.shares) == pytest.approx(row.coverage)  # of records of one length
     assert row.interval is not None
     assert 0 <= row.interval[0] <= row.coverage <= row.interval[1] <= 1
 

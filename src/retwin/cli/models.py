@@ -335,14 +335,28 @@ def _verdict(scores: list[ModelScore], *, started: bool = False) -> list[str]:
                 )
                 continue
             if each.interval is None or each.interval[1] >= LEVEL:
-                known = "fewer than five" if each.interval is None else "these"
-                made.append(
-                    f"{text}; {known} records cannot tell whether that is by "
-                    "chance: score more of other days before you rely on it."
-                )
+                made.append(f"{text}{_describe_records(each)}")
                 continue
             other = START * (not started)
             made.append(
                 f"{text}: do not rely on it here. These records may be of another day{other}."
             )
     return made
+
+
+def _describe_records(score: ModelScore) -> str:
+    """In how many records a band holds too little where that may be chance, and what to do."""
+    from retwin.report.labels import counted
+    from retwin.update.forecast_errors import LEVEL
+
+    shares = [each for each in score.shares if each is not None]
+    few, rest = score.interval is None, len(score.shares) - len(shares)
+    text = f": under {LEVEL:.0%} in {sum(each < LEVEL for each in shares)} of "
+    text += f"{counted(len(shares), 'record')}, {min(shares):.0%} in the worst. "
+    if rest:
+        text += f"{rest} more had no band, outside of the range of the calibration or longer. "
+    text += "Fewer than five records" if few else "Records that differ so much"
+    return (
+        f"{text} cannot show whether that is chance: give fit more records, of other days, and "
+        "evaluate others again."
+    )

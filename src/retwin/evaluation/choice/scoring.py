@@ -40,6 +40,8 @@ class ModelScore:
         for a predictor without bands.
     interval : (float, float) or None
         95 % interval of the coverage, from what varies between records; None for fewer than five.
+    shares : tuple of (float or None)
+        The coverage of each record; None of one without a measured sample that has a band.
 
     """
 
@@ -51,6 +53,7 @@ class ModelScore:
     coverage: float
     width: float
     interval: tuple[float, float] | None = None
+    shares: tuple[float | None, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,10 +251,13 @@ def score_model(
             error = (measured - each.mean)[..., channel]
             deviation = each.deviation[..., channel]
             banded = own & (deviation > 0)
-            hits, counts = (np.abs(error) <= USUAL * deviation) & banded, banded.sum(axis=1)
-            interval = grouped_share_interval(hits.sum(axis=1)[counts > 0], counts[counts > 0])
+            counts = banded.sum(axis=1)
+            hits = ((np.abs(error) <= USUAL * deviation) & banded).sum(axis=1)
+            interval = grouped_share_interval(hits[counts > 0], counts[counts > 0])
+            pairs = zip(hits.tolist(), counts.tolist(), strict=True)
+            shares = tuple(hit / count if count else None for hit, count in pairs)
             scores = _scores(error[own], deviation[own])
-            rows.append(ModelScore(who, output, horizon, *scores, interval))
+            rows.append(ModelScore(who, output, horizon, *scores, interval, shares))
     return rows
 
 
