@@ -183,7 +183,7 @@ def test_bands_hold_where_records_begin_in_other_states(tmp_path: Path) -> None:
     assert any("Records begin in different states" in each for each in found.remarks)
     assert not correction_remarks(found.scores, "dynamics")
     alike = [replace(each, rmse=found.score("parameters").rmse) for each in found.scores]
-    assert "does not express what the twin lacks" in correction_remarks(alike, "dynamics")[0]
+    assert "changes the bands alone" in correction_remarks(alike, "dynamics")[0]
     # From starts that their first samples give, they are predicted from the start on.
     found.twin.save(tmp_path / "model")
     for model in (found.twin, rt.load_twin(tmp_path / "model")):
@@ -277,7 +277,7 @@ def test_a_saved_model_predicts_the_same(tmp_path: Path, method: str) -> None:
     data = records(0, slope=radiating)
     found = rt.fit(twin_of(), data, rt.Choice(candidates=FAST, method=method))
     assert found.chosen == method
-    assert any("The method was given" in each for each in found.remarks) == (method == "none")
+    assert any("Taken, as asked for" in each for each in found.remarks) == (method == "none")
     # In place of a model of another kind, as a former fit leaves it.
     (tmp_path / "model" / "residual").mkdir(parents=True)
     found.save(tmp_path / "model")
@@ -431,7 +431,7 @@ def test_no_dead_time_is_mentioned_of_an_output_that_never_changes() -> None:
     assert not any("earlier" in each or "dead time" in each for each in remarks)
 
 
-def remarks_with(data: rt.Trajectories, **errors: NDArray) -> tuple[str, ...]:
+def remarks_with(data: rt.Trajectories, wanted: str = "", **errors: NDArray) -> tuple[str, ...]:
     """What is said of candidates with such errors (n, T, d_y), which need no fit."""
     folds = folds_of(data)
     predicted = {
@@ -443,21 +443,33 @@ def remarks_with(data: rt.Trajectories, **errors: NDArray) -> tuple[str, ...]:
     comparison = Comparison(data, folds, predicted)
     chosen, differences = comparison.simplest()
     scores = [_row(name, comparison, differences, 0.0, "") for name in errors]
-    return remarks_of(data, comparison, scores, chosen, chosen, None)
+    return remarks_of(data, comparison, scores, wanted or chosen, chosen, None, wanted)
 
 
 def test_a_correction_that_is_better_by_chance_is_said_to_be_so() -> None:
     rng = np.random.default_rng(0)
     data = records(*range(4), slope=right)
     noise = rng.normal(size=data.observed.shape)
-    (said,) = remarks_with(data, none=noise, dynamics=1.1 * noise)
+    said, more = remarks_with(data, none=noise, dynamics=1.1 * noise)
     assert said.startswith("No correction helps: corrected state equations did not predict")
-    assert "Corrections of outputs were not tried: without --dynamics" in said
+    assert more.startswith("Corrections of outputs were not tried: without --dynamics")
     other = 0.98 * rng.normal(size=noise.shape)
-    (said,) = remarks_with(data, none=noise, dynamics=other)
+    said, _ = remarks_with(data, none=noise, dynamics=other)
     assert "No correction is clearly better than the twin" in said
     assert "(corrected state equations) is better by" in said
     assert "within one standard error" in said
+
+
+def test_a_method_that_was_asked_for_is_said_once_to_be_no_better() -> None:
+    rng = np.random.default_rng(0)
+    data = records(*range(4), slope=right)
+    noise = rng.normal(size=data.observed.shape)
+    for scale, how in ((0.98, "as well, more simply,"), (2.0, "clearly better")):
+        other = scale * rng.normal(size=noise.shape)
+        taken, *_, more = remarks_with(data, "dynamics", none=noise, dynamics=other)
+        assert f"predicted {how} by the twin as it is (CRPS" in taken
+        assert taken.startswith("Taken, as asked for: corrected state equations. Parts of")
+        assert more.startswith("Corrections of outputs were not tried")
 
 
 def test_errors_that_no_correction_expresses_are_mentioned() -> None:
@@ -467,7 +479,7 @@ def test_errors_that_no_correction_expresses_are_mentioned() -> None:
     slow = 2 * np.cos(30 * drift)
     for error, said in ((drift, "depend on the time"), (slow, "are correlated in time")):
         remarks = remarks_with(data, none=noise + error)
-        assert any(f"The errors there {said}" in each for each in remarks)
+        assert any(f"errors of the twin {said}" in each for each in remarks)
 
 
 def test_folds_leave_out_what_is_measured_and_never_the_start_of_one_record() -> None:
@@ -636,7 +648,9 @@ def test_a_method_that_is_clearly_worse_is_taken_where_it_is_forced(*, forced: b
     assert found.preferred == "parameters"
     assert found.chosen == ("none" if forced else "parameters")
     said = (
-        "would have been taken" if forced else "The method that was asked for (the twin as it is)"
+        "left out are predicted clearly better by identified parameters (CRPS"
+        if forced
+        else "The method that was asked for (the twin as it is)"
     )
     assert said in found.remarks[0]
     wanted = rt.fit(twin_of(), data, rt.Choice(both, "parameters", forced=forced))

@@ -167,7 +167,8 @@ def fit(
         _row(name, comparison, differences, trials.seconds[name], reasons.get(name, ""))
         for name in trials.names
     )
-    remarks = (*remarks_of(records, comparison, scores, chosen, preferred, horizon), *limit_remarks)
+    said = remarks_of(records, comparison, scores, chosen, preferred, horizon, wanted)
+    remarks = (*said, *limit_remarks)
     if settings.identified and "none" not in names and "parameters" in names:
         remarks = (*remarks, IDENTIFIED)
     if wanted and chosen != wanted:
@@ -185,7 +186,7 @@ def fit(
         scores=scores,
         remarks=(
             *remarks,
-            *(begins or correction_remarks(scores, chosen)),
+            *(begins or (correction_remarks(scores, chosen) if chosen == preferred else ())),
             *_at_bounds(whole, parameters),
             *_of_prior(model, others),
         ),

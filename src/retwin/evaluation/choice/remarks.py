@@ -37,14 +37,18 @@ def remarks_of(
     chosen: str,
     preferred: str,
     horizon: float | None,
+    wanted: str = "",
 ) -> tuple[str, ...]:
-    """The sentences, the most important one first."""
+    """The sentences, the most important one first; `wanted` is the method that was asked for."""
     by_name = {each.name: each for each in scores}
     made = []
     if chosen != preferred:
+        own, other = by_name[chosen], by_name[preferred]
+        how = "clearly better" if own.difference > own.standard_error else "as well, more simply,"
         made.append(
-            f"The method was given ({by_name[chosen].title}); of those that were compared, "
-            f"{by_name[preferred].title} would have been taken."
+            f"Taken, as asked for: {own.title}. Parts of the records that were left out are "
+            f"predicted {how} by {other.title} (CRPS {other.crps:.3g} in place of {own.crps:.3g}), "
+            "taken where no method is asked for."
         )
     made += _worse_than_mean(records, by_name[chosen], free=horizon is None)
     if len(records) < RECORDS:
@@ -54,7 +58,7 @@ def remarks_of(
             f"from fewer than {RECORDS} records, of which whole ones are left out."
         )
     if preferred in UNCORRECTED:
-        made += _describe_uncorrected(comparison, by_name, preferred, free=horizon is None)
+        made += _describe_uncorrected(comparison, by_name, preferred, wanted, free=horizon is None)
     baseline = "parameters" if "parameters" in comparison.predicted else "none"
     if baseline in comparison.predicted and horizon is None:
         made += _of_twin(records, comparison, baseline)
@@ -62,27 +66,38 @@ def remarks_of(
 
 
 def _describe_uncorrected(
-    comparison: Comparison, scores: Mapping[str, CandidateScore], name: str, *, free: bool
+    comparison: Comparison,
+    scores: Mapping[str, CandidateScore],
+    name: str,
+    wanted: str,
+    *,
+    free: bool,
 ) -> list[str]:
     """How much better corrections are than the twin, and whether its errors are no noise.
 
-    Errors of free simulation are tested (`free`): others are correlated up to the time ahead.
+    That of a `wanted` one alone is said with the decision. Errors of free simulation are tested
+    (`free`): others are correlated up to the time ahead.
     """
     who = "the twin with its identified parameters" if name == "parameters" else "the twin"
-    tried = [scores[each].title for each in comparison.predicted if each not in UNCORRECTED]
-    made = "No correction was tried."
-    if tried:
-        made = f"No correction helps: {' and '.join(tried)} did not predict parts of the records "
-        made += f"that were left out better than {who}."
+    tried, made = [each for each in comparison.predicted if each not in UNCORRECTED], []
+    if not (tried or wanted):
+        made = ["No correction was tried."]
+    elif tried and tried != [wanted]:
+        titles = " and ".join(scores[each].title for each in tried)
+        text = f"No correction helps: {titles} did not predict parts of the records that were left "
+        text += f"out better than {who}."
+        if scores[name].difference > 0:
+            best = min((scores[each] for each in comparison.predicted), key=lambda each: each.crps)
+            share = scores[name].difference / scores[name].crps
+            text = f"No correction is clearly better than {who}: on parts of the records that were "
+            text += f"left out, the best one ({best.title}) is better by {share:.1%} (CRPS), which "
+            text += "is within one standard error."
+        made = [text]
     if "dynamics" in scores and "output" not in scores:
-        made += " Corrections of outputs were not tried: without --dynamics, fit tries them too, "
-        made += "and takes several times as long."
-    if scores[name].difference > 0:
-        best = min((scores[each] for each in comparison.predicted), key=lambda each: each.crps)
-        made = f"No correction is clearly better than {who}: on parts of the records that were "
-        share = scores[name].difference / scores[name].crps
-        made += f"left out, the best one ({best.title}) is better by {share:.1%} (CRPS), which is "
-        made += "within one standard error."
+        made.append(
+            "Corrections of outputs were not tried: without --dynamics, fit tries them too, and "
+            "takes several times as long."
+        )
     errors = comparison.joined(lambda i: comparison.errors(name, i))
     reasons = ["depend on the time in the record"] * errors_drift(errors)
     found = [autocorrelation(own) for own in np.moveaxis(errors, 2, 0)]
@@ -91,11 +106,13 @@ def _describe_uncorrected(
         for each in found
     ):
         reasons.append("are correlated in time")
-    if not (free and reasons):
-        return [made]
-    text = f"The errors there {' and '.join(reasons)}: the twin lacks something that these "
-    text += "corrections cannot express, unless it is a disturbance from outside or sensor noise."
-    return [made, text]
+    if free and reasons:
+        made.append(
+            f"On parts that were left out, errors of {who} {' and '.join(reasons)}: unless that is "
+            "a disturbance from outside or sensor noise, the twin lacks something that no "
+            "correction which was tried expresses. Write it into the twin."
+        )
+    return made
 
 
 def start_remarks(records: Trajectories, errors: ForecastErrors | None, begin: float) -> list[str]:
@@ -130,9 +147,9 @@ def correction_remarks(scores: Sequence[CandidateScore], chosen: str) -> list[st
     if any(rmse[chosen][name] < HARDLY * error for name, error in before.items()):
         return []
     return [
-        f"The correction lowers the RMS error of no output by more than {1 - HARDLY:.0%}: it gives "
-        "better bands, and does not express what the twin lacks, unless that is a disturbance from "
-        "outside. Write it into the twin."
+        f"The correction lowers the RMS error of no output by more than {1 - HARDLY:.0%}: it "
+        "changes the bands alone. If the twin lacks more than a disturbance from outside, write "
+        "that into the twin."
     ]
 
 
