@@ -5,14 +5,29 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import retwin as rt
 from retwin.data.quality.finding import Finding
+from retwin.evaluation.choice.fitted import CandidateScore
 from retwin.report.blocks import Cell, Column, Table
+from retwin.report.choice import comparison_table
 from retwin.report.glossary import explained
 from retwin.report.labels import distinct, learned_name, percent, percents
 from retwin.report.page import DOCS
 from retwin.report.records import finding_rows
+
+
+def test_differences_have_the_digits_of_the_score_and_shares_the_order_of_the_outputs() -> None:
+    shares = {"speed": 0.9, "bearing": 0.84}
+    score = CandidateScore("none", "as is", shares, 1.0, 0.0097, 6e-7, 5e-7, shares, 1.0)
+    outputs = rt.Channels(("speed", "bearing"), ("rpm", "degC"))
+    records = SimpleNamespace(outputs=outputs)
+    found = SimpleNamespace(scores=[score], parts=("a",), chosen="none", records=records)
+    ((*_, behind, hold, _),) = comparison_table(found).rows  # type: ignore[arg-type]
+    assert (behind.text, behind.below) == ("0.00000", "± 0.00000")
+    assert (hold.text, hold.below) == ("87%", "(90%, 84%)")
 
 
 def test_columns_and_rows_of_dashes_are_not_drawn() -> None:

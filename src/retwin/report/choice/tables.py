@@ -39,7 +39,8 @@ def comparison_table(found: Fitted) -> Table:
                 rows.append([Cell(each.title, each.reason), *["–"] * (len(units) + 4)])
                 continue
             size = each.standard_error
-            error = f"± {significant(size, size or each.crps)}" if isfinite(size) else ""
+            like = max(each.crps / 10, size)  # digits that matter beside the score
+            error = f"± {significant(size, like)}" if isfinite(size) else ""
             rows.append(
                 [
                     Cell(each.title, "taken" if best else "", best=best),
@@ -48,7 +49,7 @@ def comparison_table(found: Fitted) -> Table:
                         for n, unit in units.items()
                     ),
                     Cell(significant(each.crps), best=best),
-                    Cell(significant(each.difference, size or each.crps), error),
+                    Cell(significant(each.difference, like), error),
                     _coverage(each.coverage),
                     duration(each.seconds),
                 ]
@@ -59,12 +60,10 @@ def comparison_table(found: Fitted) -> Table:
 
 
 def _coverage(shares: Mapping[str, float]) -> Cell:
-    """The mean share in the bands of the outputs, and that of each where there are several."""
-    known = {name: share for name, share in shares.items() if isfinite(share)}
-    own = ", ".join(f"{name} {share:.0%}" for name, share in known.items())
-    return Cell(
-        f"{mean(known.values()):.0%}" if known else "–", f"({own})" if len(known) > 1 else ""
-    )
+    """The mean share in the bands of the outputs, and that of each in turn if there are several."""
+    known = [share for share in shares.values() if isfinite(share)]
+    own = ", ".join(f"{share:.0%}" if isfinite(share) else "–" for share in shares.values())
+    return Cell(f"{mean(known):.0%}" if known else "–", f"({own})" if len(shares) > 1 else "")
 
 
 def parameter_table(found: Fitted) -> Table:
