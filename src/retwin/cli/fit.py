@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 ModelFolder = Annotated[Path, option("FOLDER", "Where to save the updated twin.")]
 RealSet = Annotated[list[Path], option("FILE", "Real records; may be repeated.")]
 StateEquations = Annotated[
-    bool, option("", "Correct the state equations, if no worse.", "--dynamics")
+    bool, option("", "Correct the state equations, if clearly better.", "--dynamics")
 ]
 Correction = Annotated[
     str | None,
@@ -276,7 +276,7 @@ def _print(found: Fitted, base: StandIn, out: Path, *, as_json: bool) -> None:
         if rows:
             shown += [f"{each.title}:", table(heads, rows, numbers=heads[1:]), ""]
     if found.parts and found.chosen == found.preferred:
-        shown.insert(2, "→ is the first within one standard error of the best CRPS.")
+        shown.insert(2, "→ is the first within one standard error, or 2 %, of the best CRPS.")
     if found.parts:
         shown.insert(2, f"Errors are those of {found.how}.")
     figures, outputs = base.figures, found.records.outputs

@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.evaluation.choice.folds import Fold, block_length, block_means
+from retwin.evaluation.choice.folds import Fold, block_length, independent_means
 from retwin.scores.distributions import crps_normal
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.forecast_errors import LEVEL, USUAL
 from retwin.update.forecasts import forecasts, free_moments, started_moments
+
+HARDLY = 0.02
+"""Share of an error below which a difference counts as none, however sure it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +174,13 @@ class Comparison:
         total = np.where(seen, each, 0.0).sum(axis=2)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
-    def block_scores(self, name: str) -> NDArray:
-        """Mean scores (B,) of nearly independent blocks, which are the same for all models."""
-        made = [block_means(self.scores(name, i), self._lengths[i]) for i in self._all]
-        return np.concatenate(made)
+    def independent_scores(self, name: str) -> NDArray:
+        """Mean scores (B,) of records or blocks, see `independent_means`; those of all models."""
+        folds, shape = len(self.folds), self.records.mask.shape[:2]
+        values = np.full((shape[0], folds, shape[1]), np.nan)
+        for i, fold in enumerate(self.folds):
+            values[fold.rows, i] = self.scores(name, i)
+        return independent_means(values, self._lengths)
 
     @cached_property
     def _lengths(self) -> list[int]:
@@ -199,7 +205,7 @@ class Comparison:
     @property
     def best(self) -> float:
         """The lowest mean score of a model."""
-        return min(float(self.block_scores(name).mean()) for name in self.predicted)
+        return min(float(self.independent_scores(name).mean()) for name in self.predicted)
 
     @property
     def _all(self) -> range:
@@ -220,6 +226,8 @@ class Comparison:
     def simplest(self) -> tuple[str, dict[str, tuple[float, float]]]:
         """The simplest model within one standard error of the best one (Breiman et al., 1984).
 
+        A difference below HARDLY of the best score counts as none, too.
+
         Returns
         -------
         chosen : str
@@ -229,12 +237,18 @@ class Comparison:
             error of that.
 
         """
-        scores = {name: self.block_scores(name) for name in self.predicted}
+        scores = {name: self.independent_scores(name) for name in self.predicted}
         best = min(scores, key=lambda name: float(scores[name].mean()))
         differences = {}
         for name, own in scores.items():
             change = own - scores[best]
             error = change.std(ddof=1) / np.sqrt(len(change)) if len(change) > 1 else 0.0
             differences[name] = float(change.mean()), float(error)
-        chosen = next(name for name, (mean, error) in differences.items() if mean <= error)
+        lowest = float(scores[best].mean())
+        chosen = next(name for name, own in differences.items() if not is_behind(*own, lowest))
         return chosen, differences
+
+
+def is_behind(difference: float, error: float, best: float) -> bool:
+    """Whether a score differs from the best by more than a standard error, and than HARDLY."""
+    return difference > max(error, HARDLY * best)

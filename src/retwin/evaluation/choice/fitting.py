@@ -22,7 +22,7 @@ from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.choice.candidates import Candidates, Model
 from retwin.evaluation.choice.comparison import Comparison
 from retwin.evaluation.choice.fitted import CandidateScore, Fitted
-from retwin.evaluation.choice.folds import Fold, block_length, block_means, folds_of
+from retwin.evaluation.choice.folds import Fold, block_length, folds_of, independent_means
 from retwin.evaluation.choice.remarks import (
     STARTED,
     correction_remarks,
@@ -71,8 +71,8 @@ JUDGED = (
 """How the model is used then."""
 
 NOT_TAKEN = (
-    "The method that was asked for ({}) predicts left-out parts of the records clearly worse than: "
-    "{}, which was taken. --no-compare takes it all the same, and judges nothing."
+    "The method that was asked for ({}) does not predict left-out parts of the records clearly "
+    "better than: {}, which was taken. --no-compare takes it all the same, and judges nothing."
 )
 """What is said where the method that was asked for is not the one that is taken."""
 
@@ -100,8 +100,8 @@ def fit(
     with a delay and an offset per segment, with a residual of each output sample, and the last two
     in series, as far as the twin and the records allow. Each is fitted without each part of the
     records in turn, and predicts it. The simplest is taken whose score (CRPS) is within one
-    standard error of the best one, and fitted to all records; its bands are calibrated by its
-    errors on the parts that were left out.
+    standard error of the best one, or 2 %, and fitted to all records; its bands are calibrated by
+    its errors on the parts that were left out.
 
     Parameters
     ----------
@@ -160,8 +160,7 @@ def fit(
             comparison, reasons, begin = started, failed, trials.begin
     preferred, differences = comparison.simplest()
     wanted = settings.method
-    excess, error = differences.get(wanted, (np.inf, 0.0))
-    chosen = wanted if wanted and (settings.forced or excess <= error) else preferred
+    chosen = wanted if wanted and settings.forced else preferred
     model = _calibrate(_fit_chosen(whole, chosen, given), trials, chosen, free)
     scores = tuple(
         _row(name, comparison, differences, trials.seconds[name], reasons.get(name, ""))
@@ -426,7 +425,8 @@ def _behind(found: Fitted, comparison: Comparison, kind: str) -> tuple[float, fl
     seen = np.isfinite(change)
     if not seen.any():
         return float("nan"), float("nan")
-    own = block_means(change, block_length(np.nan_to_num(change), seen))
+    lengths = [block_length(np.nan_to_num(change), seen)]
+    own = independent_means(change[:, None], lengths)
     chance = own.std(ddof=1) / np.sqrt(len(own)) if len(own) > 1 else float("inf")
     return float(own.mean()), float(chance)
 
@@ -449,7 +449,7 @@ def _row(
         title,
         dict(zip(names, rmse.tolist(), strict=True)),
         float(np.mean(rmse / comparison.spread)),
-        float(comparison.block_scores(name).mean()),
+        float(comparison.independent_scores(name).mean()),
         *differences[name],
         dict(zip(names, comparison.coverage(name).tolist(), strict=True)),
         seconds,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -120,6 +121,19 @@ def _edges(records: Trajectories, *, reaching: float = 0.25, short: int = 24) ->
         reached[::count] = -1.0
     chosen = np.argsort(-reached, kind="stable")[: max(1, int(reaching * len(reached)))]
     return np.asarray(np.isin(number, chosen) & seen)
+
+
+def independent_means(values: NDArray, lengths: Sequence[int]) -> NDArray:
+    """Means of what is nearly independent in scores (n, F, T) of F parts, without those of NaN.
+
+    Where whole records are left out, it is a record, whichever parts it belongs to: records differ
+    as other days do, which blocks within them do not show. Else it is a block of `lengths` (F,).
+    """
+    if len(values) >= RECORDS:
+        return block_means(values.reshape(len(values), -1), values.size)
+    return np.concatenate(
+        [block_means(own, e) for own, e in zip(values.swapaxes(0, 1), lengths, strict=True)]
+    )
 
 
 def block_means(values: NDArray, length: int) -> NDArray:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from retwin.data.trajectories import Trajectories
-from retwin.evaluation.choice.comparison import Comparison
+from retwin.evaluation.choice.comparison import HARDLY, Comparison, is_behind
 from retwin.evaluation.choice.fitted import CandidateScore
 from retwin.evaluation.choice.folds import RECORDS
 from retwin.scores.residuals import autocorrelation, ljung_box
@@ -18,9 +18,8 @@ from retwin.update.forecasts import begin_of, errors_drift
 
 LONGEST = 0.1
 """Longest dead time that is tried, over the length of a record."""
-STARTED, HARDLY = 0.8, 0.98
-"""Ratios of errors from which starts of records are named, and a correction is said to be one of
-bands alone."""
+STARTED = 0.8
+"""Ratio of errors from which starts of records are named."""
 UNCORRECTED = ("none", "parameters")
 """The candidates that correct nothing."""
 AHEAD = 20
@@ -44,7 +43,8 @@ def remarks_of(
     made = []
     if chosen != preferred:
         own, other = by_name[chosen], by_name[preferred]
-        how = "clearly better" if own.difference > own.standard_error else "as well, more simply,"
+        behind = is_behind(own.difference, own.standard_error, other.crps)
+        how = "clearly better" if behind else "as well, more simply,"
         made.append(
             f"Taken, as asked for: {own.title}. Parts of the records that were left out are "
             f"predicted {how} by {other.title} (CRPS {other.crps:.3g} in place of {own.crps:.3g}), "
@@ -91,7 +91,7 @@ def _describe_uncorrected(
             share = scores[name].difference / scores[name].crps
             text = f"No correction is clearly better than {who}: on parts of the records that were "
             text += f"left out, the best one ({best.title}) is better by {share:.1%} (CRPS), which "
-            text += "is within one standard error."
+            text += f"is within one standard error, or below {HARDLY:.0%}."
         made = [text]
     if "dynamics" in scores and "output" not in scores:
         made.append(
@@ -144,10 +144,10 @@ def correction_remarks(scores: Sequence[CandidateScore], chosen: str) -> list[st
     before = rmse.get("parameters", rmse.get("none"))
     if before is None or chosen not in rmse or chosen in UNCORRECTED:
         return []
-    if any(rmse[chosen][name] < HARDLY * error for name, error in before.items()):
+    if any(rmse[chosen][name] < (1 - HARDLY) * error for name, error in before.items()):
         return []
     return [
-        f"The correction lowers the RMS error of no output by more than {1 - HARDLY:.0%}: it "
+        f"The correction lowers the RMS error of no output by more than {HARDLY:.0%}: it "
         "changes the bands alone. If the twin lacks more than a disturbance from outside, write "
         "that into the twin."
     ]

@@ -47,7 +47,7 @@ class Choice:
     method : str
         The candidate that is taken whatever the comparison shows; by default the one that it shows.
     forced : bool
-        Whether that is so also where another candidate is better by more than a standard error.
+        Whether that is so also where a simpler candidate is not clearly worse.
     horizon : float, optional
         Time in s over which predictions from measurements are judged; by default free simulation
         from the commands alone.
