@@ -15,7 +15,8 @@ from retwin.evaluation.identification.validation import validate_identification
 from retwin.testing import TWIN_CHECKS, TwinSubject
 from retwin.twins import State, StateTwin
 from retwin.update.identification import Evolution, LeastSquares, identify, profile
-from retwin.update.identification.search import Loss
+from retwin.update.identification.misfit import misfit_of
+from retwin.update.identification.search import Loss, Search
 
 GAIN, SHARE = 1.7, 0.8
 
@@ -301,7 +302,7 @@ TRUE = {"gain": 3.0, "loss": 0.5}
 """Parameters of the equations of a lag, which its commands move to levels from 0 to 6."""
 
 
-def lagging() -> rt.ParametricTwin:
+def lagging(least: float = 0.05) -> rt.ParametricTwin:
     return StateTwin(
         [State("x", start=0.0)],
         lambda x, u: x.x,
@@ -309,8 +310,38 @@ def lagging() -> rt.ParametricTwin:
         rt.Channels(("y",), ("m",)),
         10.0,
         derivative=lambda x, u, p: (p.gain * u.u - p.loss * x.x,),
-        parameters=[rt.Parameter("gain", "1", 0.1, 10.0), rt.Parameter("loss", "1", 0.05, 5.0)],
+        parameters=[rt.Parameter("gain", "1", 0.1, 10.0), rt.Parameter("loss", "1", least, 5.0)],
     ).parametric()
+
+
+@pytest.mark.parametrize("least", [-5.0, -20.0, -60.0])
+def test_a_twin_that_runs_away_within_its_ranges_is_identified(least: float) -> None:
+    twin = lagging(least)  # at -20 it reaches 1e170 at the end, whose square is infinite
+    steps = np.random.default_rng(3).uniform(0.0, 1.0, (4, 10, 1)).repeat(20, axis=1)
+    made = twin.with_values(TRUE).simulate(steps, seed=0)
+    noise = 0.02 * np.random.default_rng(4).normal(size=made.observed.shape)
+    starting = twin.with_values({"gain": 1.0, "loss": 1.0})
+    observed = made.replace(observed=made.observed + noise)
+    updated = identify(starting, observed, LeastSquares(6), seed=0)
+    for name, true in TRUE.items():
+        assert abs(updated.values[name] - true) < 3 * updated.errors[name] < 0.2
+
+
+def test_residuals_that_run_away_can_be_squared_and_leave_the_others_their_derivatives() -> None:
+    twin = lagging(-100.0).with_values(TRUE)
+    steps = np.random.default_rng(3).uniform(0.0, 1.0, (2, 10, 1)).repeat(20, axis=1)
+    with misfit_of(twin, twin.simulate(steps, seed=0), seed=0, rate=None, processes=1) as misfit:
+        search = Search(misfit, LeastSquares(), None)
+        for loss, runs_away in ((1.0, False), (-1.0, True), (-20.0, True), (-90.0, True)):
+            point = (np.array([3.0, loss]) - misfit.low) / search.width
+            residual = search.residuals(point[None])[0]
+            limited = np.abs(residual) == search.limit
+            assert limited.any() == runs_away
+            assert np.isfinite(np.sum(residual**2))
+            jacobian = search.jacobian(point)
+            assert np.isfinite(jacobian.T @ jacobian).all()
+            assert not jacobian[limited].any()
+            assert jacobian[~limited].any() == (not limited.all())
 
 
 @pytest.mark.parametrize("count", [1, 4])

@@ -38,13 +38,16 @@ def warn_of_coarse_steps(
         The root mean square difference is more than 1 % of the output's standard deviation.
 
     """
-    error = np.sqrt(np.mean((outputs - finer) ** 2, axis=0))
+    # In sizes of the outputs, which may grow beyond what can be squared.
+    size = np.maximum(np.abs(outputs).max(axis=0), np.abs(finer).max(axis=0))
+    size = np.where(size > 0, size, 1.0)
+    error = np.sqrt(np.mean((outputs / size - finer / size) ** 2, axis=0))
     # An output that hardly varies is compared with its size, of which rounding is a fraction.
-    with np.errstate(over="ignore"):  # of outputs that grow beyond what can be squared
-        allowed = ACCURACY * np.maximum(finer.std(axis=0), 1e-6 * np.abs(finer).max(axis=0))
-    worst = int(np.argmax(error - allowed))
+    allowed = ACCURACY * np.maximum((finer / size).std(axis=0), 1e-6)
+    worst = int(np.argmax(error / allowed))
     if error[worst] <= allowed[worst]:
         return
+    error = error * size
     warnings.warn(
         f"{channels.names[worst]} has an error of {error[worst]:.1g} {channels.units[worst]} with "
         f"substeps={substeps}, over 1 % of its standard deviation; give more substeps",

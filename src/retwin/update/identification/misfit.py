@@ -146,11 +146,12 @@ class Misfit:
 
         None where the twin gives none that are finite.
         """
-        made = (
-            self.twin.sensitivities(self._commands, theta)
-            if self.windows is None
-            else self.windows.derivatives(theta)
-        )
+        with np.errstate(all="ignore"):  # simulations that run away have none
+            made = (
+                self.twin.sensitivities(self._commands, theta)
+                if self.windows is None
+                else self.windows.derivatives(theta)
+            )
         if made is None or not np.isfinite(made).all():
             return None
         self.twin_runs += len(self._commands)

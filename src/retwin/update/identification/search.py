@@ -22,7 +22,8 @@ TOLERANCE = 1e-6
 """Relative change of the objective, and of the parameters, at which the search stops. It is far
 below the effect of noise on them."""
 FAILED = 1e3
-"""Residual of a simulation that fails, in standard deviations of the output."""
+"""Residual of a simulation that fails, and the largest of others, in standard deviations of the
+output or RMS errors at the present values, whichever is larger."""
 AT_BOUND = 1e-3
 """Distance from a bound that counts as on it, in widths of the bounds."""
 MIN_CURVATURE = 0.05
@@ -134,6 +135,8 @@ class Search:
         (k,) bool, the parameters that are searched.
     held : NDArray
         (k,), the point of the others, 0 where a parameter is free.
+    limit : float
+        Largest absolute residual: of a simulation that runs away the square would be infinite.
     loss, scale
         The loss of the last search, and the residual beyond which a robust one grows slower.
 
@@ -148,6 +151,7 @@ class Search:
         self.width = misfit.high - misfit.low
         self.free = np.ones(len(self.width), dtype=bool)
         self.held = np.zeros(len(self.width))
+        self.limit = FAILED * max(misfit.spread, misfit.rms)
         self.loss: Loss = "linear"
         self.scale = 1.0
 
@@ -242,7 +246,7 @@ class Search:
     def residuals(self, points: NDArray) -> NDArray:
         """Residuals (m, n P d_y) at points (m, number of free ones)."""
         flat = self.misfit.residuals(self.theta(points)).reshape(len(points), -1)
-        return np.nan_to_num(flat, nan=FAILED * self.misfit.spread)
+        return np.clip(np.nan_to_num(flat, nan=self.limit), -self.limit, self.limit)
 
     def jacobian(
         self, point: NDArray, *, sides: Literal[1, 2] = 2, residual: NDArray | None = None
@@ -250,18 +254,23 @@ class Search:
         """Derivative (n P d_y, k) at a point (k,), the twin's own or by differences.
 
         Differences are one-sided, or central but at a bound and next to a simulation that fails.
-        `residual` (n P d_y,) is that at the point, if it is known.
+        `residual` (n P d_y,) is that at the point, if it is known. It is 0 where a residual is at
+        its limit.
         """
-        exact = self.misfit.derivatives(self.theta(point[None])[0])
-        if exact is not None:
-            return (exact * self.width)[:, self.free]
-        step = np.diag(np.where(point > 0.5, -DIFFERENCE, DIFFERENCE))
-        inward, outward = np.clip(point + step, 0, 1), np.clip(point - step, 0, 1)
         if residual is None:
             residual = self.residuals(point[None])[0]
+        limited = np.abs(residual) >= self.limit
+        exact = self.misfit.derivatives(self.theta(point[None])[0])
+        if exact is not None:
+            largest = self.limit / DIFFERENCE
+            own = np.clip((exact * self.width)[:, self.free], -largest, largest)
+            return np.where(limited[:, None], 0.0, own)
+        step = np.diag(np.where(point > 0.5, -DIFFERENCE, DIFFERENCE))
+        inward, outward = np.clip(point + step, 0, 1), np.clip(point - step, 0, 1)
         points = np.concatenate([inward, outward]) if sides == 2 else inward
-        residuals = self.misfit.residuals(self.theta(points)).reshape(len(points), -1)
-        failed = np.isnan(residuals).any(axis=1)
+        residuals = self.residuals(points)
+        failed = ((np.abs(residuals) >= self.limit) & ~limited).any(axis=1)
+        residuals[:, limited] = residual[limited]
         points[failed], residuals[failed] = point, residual
         size = len(point)
         length = np.diag(points[:size] - (points[size:] if sides == 2 else point))[:, None]
