@@ -13,7 +13,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.scores.distributions import crps_normal
 from retwin.scores.intervals import grouped_share_interval
 from retwin.twins.twin import Twin, check_channels
-from retwin.update.forecast_errors import USUAL, ForecastErrors, warn_unlike
+from retwin.update.forecast_errors import USUAL, ForecastErrors, channel_excess, warn_unlike
 from retwin.update.forecasts import forecasts, free_moments, started_moments
 from retwin.update.training_range import OutsideTrainingWarning
 
@@ -128,7 +128,7 @@ def predict_records(
     if errors is not None:
         values = np.concatenate([records.commands, mean], axis=2)
         outside = errors.outside(values, records.rate)
-        _warn_outside(outside, records)
+        _warn_outside(errors, values, outside, records)
         late = errors.late(records.steps, records.rate) & (horizon is None)
         _warn_late(errors, late, records)
         outside |= late & errors.drifts
@@ -146,23 +146,32 @@ def _simulate_free(
     return free_moments(model, records.commands, seed=seed)
 
 
-def _warn_outside(outside: NDArray, records: Trajectories) -> None:
-    """Warn of records in which samples (n, T) have no band."""
+def _warn_outside(
+    errors: ForecastErrors, values: NDArray, outside: NDArray, records: Trajectories
+) -> None:
+    """Warn of records in which samples (n, T) have no band, with the `values` (n, T, d) why."""
     measured = np.arange(outside.shape[1]) < records.lengths[:, None]
-    first = {
-        str(name): float(np.argmax(own)) / records.rate
-        for name, own in zip(records.ids, outside & measured, strict=True)
-        if own.any()
-    }
-    if first:
-        name, time = min(first.items(), key=lambda item: item[1])
-        warnings.warn(
-            f"commands or outputs of {len(first)} of {len(records)} records leave the range for "
-            f"which bands were calibrated, {name} after {time:.4g} s; no band is given there. "
-            "Calibrate with records that contain these",
-            OutsideTrainingWarning,
-            stacklevel=3,
-        )
+    missing = outside & measured
+    if not missing.any():
+        return
+    some = missing.any(axis=1)
+    first = int(np.argmin(np.where(some, missing.argmax(axis=1), missing.shape[1])))
+    excess = channel_excess(values, errors.low, errors.high) * measured[..., None]
+    names = (*records.inputs.names, *(f"predicted {name}" for name in records.outputs.names))
+    reached = "; ".join(
+        f"{name} is {values[..., i].flat[excess[..., i].argmax()]:.4g} (calibration: "
+        f"{errors.low[i]:.4g} to {errors.high[i]:.4g})"
+        for i, name in enumerate(names)
+        if excess[..., i].max() > errors.beyond[i]
+    )
+    warnings.warn(
+        f"no band is given for {missing.sum() / measured.sum():.1%} of the samples, in "
+        f"{some.sum()} of {len(records)} records, first in {records.ids[first]} after "
+        f"{missing[first].argmax() / records.rate:.4g} s, since values leave the range for which "
+        f"bands were calibrated: {reached}. Calibrate with records that contain these",
+        OutsideTrainingWarning,
+        stacklevel=3,
+    )
 
 
 def _warn_late(errors: ForecastErrors, late: NDArray, records: Trajectories) -> None:
