@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.stats import norm
 
 import retwin as rt
 from retwin.update.forecast_errors import (
@@ -14,7 +15,9 @@ from retwin.update.forecast_errors import (
     range_excess,
     value_range,
 )
-from retwin.update.forecasts import errors_drift
+from retwin.update.forecasts import Forecasts, LeftOut, calibrate_forecasts, errors_drift
+
+OUTPUT = rt.Channels(("y",), ("m",))
 
 
 @pytest.mark.parametrize("independent", [6, 12, 200])
@@ -87,3 +90,23 @@ def test_errors_drift_where_their_mean_has_a_trend(trend: float) -> None:
         found.append(errors_drift(made[..., None]))
     assert np.mean(found) == pytest.approx(float(trend > 0), abs=0.05)
     assert not errors_drift(np.full((1, 9, 2), np.nan))
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_bands_allow_for_records_that_differ_where_whole_ones_are_left_out(*, whole: bool) -> None:
+    rng, held, shape = np.random.default_rng(0), [], (5, 200, 1)
+    nothing, one = np.zeros(shape), rt.Channels(("u",), ("1",))
+    left_out = np.ones((1, 200), dtype=bool)
+    left_out[:, 0] = whole  # else the first sample of a record was fitted
+    for _ in range(100):
+        observed = np.exp(0.6 * rng.normal(size=(5, 1, 1))) * rng.normal(size=shape)
+        data = rt.Trajectories(nothing, nothing, observed, 1.0, inputs=one, outputs=OUTPUT)
+        ahead = Forecasts(nothing[None, :1], nothing[None, :1])
+        parts = [
+            LeftOut(ahead, nothing[:1], data[[i]], left_out, np.zeros(2), edge=False)
+            for i in range(5)
+        ]
+        deviation = calibrate_forecasts(data, parts, [1]).deviation[-1, 0]
+        further = np.exp(0.6 * rng.normal(size=400))
+        held.append(np.mean(2 * norm.cdf(USUAL * deviation / further) - 1))
+    assert np.mean(held) == pytest.approx(0.9 if whole else 0.875, abs=0.01)

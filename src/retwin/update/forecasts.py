@@ -233,9 +233,10 @@ def calibrate_forecasts(
 ) -> ForecastErrors:
     """The errors of predictions, from parts of records that the models were not fitted to.
 
-    Deviations are those of parts in time. Where the bands of free simulation hold a part whose
-    commands and outputs are beyond the range of the others, such as the largest ones, they are
-    given as far beyond the range of the calibration.
+    Deviations are those of parts in time. Where these are whole records, errors are worth no more
+    independent samples than their mean squares by record show. Where the bands of free simulation
+    hold a part whose commands and outputs are beyond the range of the others, such as the largest
+    ones, they are given as far beyond the range of the calibration.
 
     Parameters
     ----------
@@ -250,10 +251,11 @@ def calibrate_forecasts(
     inner = [each for each in found if not each.edge]
     errors = [[_errors(each, i) for each in inner] for i in range(len(leads) + 1)]
     channels = range(len(records.outputs))
-    rows = [[_calibrate(pairs, channel) for channel in channels] for pairs in errors]
+    whole = all(each.held[each.record.mask.any(axis=2)].all() for each in inner)
+    rows = [[_calibrate(pairs, channel, whole=whole) for channel in channels] for pairs in errors]
     persistence, deviation, independent, correlation = np.moveaxis(np.array(rows), 2, 0)
     memory = float(FORGOTTEN * correlation[-1].max() / records.rate)
-    started = _calibrate_started(inner)
+    started = _calibrate_started(inner, whole=whole)
     held = [each.excess for each in found if _hold_all(each, deviation[-1], started)]
     beyond = np.maximum(BEYOND, np.max([0.0 * found[0].excess, *held], axis=0))
     times = np.append(np.array(leads) / records.rate, np.inf)
@@ -270,13 +272,14 @@ def calibrate_forecasts(
     return ForecastErrors(*by_lead, memory, low, high, beyond, longest, drifts, started)
 
 
-def _calibrate_started(found: Sequence[LeftOut]) -> NDArray | None:
+def _calibrate_started(found: Sequence[LeftOut], *, whole: bool) -> NDArray | None:
     """Deviations (d_y,) of simulations from starts that records give; None where there are none."""
     known = [(each, each.started) for each in found if each.started is not None]
     if not known:
         return None
     errors = [_errors(replace(each, free=mean), len(each.ahead.mean)) for each, mean in known]
-    return np.array([_calibrate(errors, i)[1] for i in range(errors[0][0].shape[2])])
+    channels = range(errors[0][0].shape[2])
+    return np.array([_calibrate(errors, i, whole=whole)[1] for i in channels])
 
 
 def errors_drift(errors: NDArray) -> bool:
@@ -342,8 +345,13 @@ def _hold(part: LeftOut, deviation: NDArray) -> bool:
     return True
 
 
-def _calibrate(pairs: Sequence[tuple[NDArray, NDArray]], channel: int) -> tuple[float, ...]:
-    """Persistence, deviation, number of independent errors, and their correlation time."""
+def _calibrate(
+    pairs: Sequence[tuple[NDArray, NDArray]], channel: int, *, whole: bool
+) -> tuple[float, ...]:
+    """Persistence, deviation, number of independent errors, and their correlation time.
+
+    Where `whole` records were left out, errors are no more independent than these show.
+    """
     errors = [each[..., channel] for each, _ in pairs]
     last = np.concatenate(
         [each[..., channel][np.isfinite(e)] for (_, each), e in zip(pairs, errors, strict=True)]
@@ -354,8 +362,28 @@ def _calibrate(pairs: Sequence[tuple[NDArray, NDArray]], channel: int) -> tuple[
     power = float(last @ last)
     share = float(np.clip(last @ flat / power, 0.0, 1.0)) if power > 0 else 0.0
     left = flat - share * last
-    number = 0.0
-    for (_, each), error in zip(pairs, errors, strict=True):
-        rest = np.where(np.isfinite(error), error - share * each[..., channel], 0.0)
-        number += np.isfinite(error).sum() / correlation_time(rest[..., None])
-    return share, predictive_deviation(left, number), number, len(flat) / number
+    rest = [
+        error - share * each[..., channel] for (_, each), error in zip(pairs, errors, strict=True)
+    ]
+    number = alone = sum(
+        np.isfinite(own).sum() / correlation_time(np.nan_to_num(own)[..., None]) for own in rest
+    )
+    if whole:
+        number = min(number, _independent_between(np.concatenate(rest)))
+    return share, predictive_deviation(left, number), number, len(flat) / alone
+
+
+def _independent_between(errors: NDArray) -> float:
+    """How many independent samples errors (n, T) of n records are worth, NaN where there is none.
+
+    As many as would let the mean square vary between records as it does (Satterthwaite, "An
+    approximate distribution of estimates of variance components", Biometrics Bulletin 2, 1946).
+    """
+    count = np.isfinite(errors).sum(axis=1)
+    square, count = np.nansum(errors[count > 0] ** 2, axis=1) / count[count > 0], count[count > 0]
+    weight = count / count.sum()
+    mean, n = float(weight @ square), len(square)
+    if n < 2:
+        return np.inf
+    variance = n / (n - 1) * float(weight**2 @ (square - mean) ** 2)
+    return 2 * mean**2 / variance if variance > 0 else np.inf
