@@ -19,6 +19,7 @@ from retwin.twins import (
     SensorBias,
     SensorDrift,
     SensorFreeze,
+    SensorGain,
     State,
     StateTwin,
 )
@@ -102,6 +103,8 @@ def test_sensors_fail_in_every_twin(twin) -> None:
     np.testing.assert_allclose(biased, np.stack([0 * TIME, np.where(acts, -0.5, 0)], 1), atol=1e-5)
     drifted = error(SensorDrift(0, size=0.3, onset=2.0, end=5.0))
     np.testing.assert_allclose(drifted[:, 0], np.where(acts, 0.3 * (TIME - 2), 0), atol=1e-5)
+    scaled = error(SensorGain(1, size=-0.2, onset=2.0, end=5.0))[:, 1]
+    np.testing.assert_allclose(scaled, np.where(acts, -0.2 * healthy[:, 1], 0), atol=1e-5)
     frozen = error(SensorFreeze(0, onset=2.0)) + healthy
     np.testing.assert_allclose(frozen[TIME >= 2, 0], healthy[20, 0], rtol=1e-9)
     np.testing.assert_allclose(frozen[:, 1], healthy[:, 1], rtol=1e-9)
@@ -139,6 +142,7 @@ def test_what_is_open_is_drawn_between_its_limits() -> None:
     [
         (lambda: SensorBias(0, size=0.0), "other than 0"),
         (lambda: SensorBias(0, size=(2.0, 1.0)), "in order"),
+        (lambda: SensorGain(0, size=(-1.0, 1.0)), "more than -1"),
         (lambda: SensorBias(0, size=float("nan")), "size"),
         (lambda: SensorBias(0, size=1.0, onset=-1.0), "onset"),
         (lambda: SensorBias(0, size=1.0, onset=3.0, end=2.0), "after the onset"),

@@ -32,7 +32,7 @@ _HOME = homes(
         "faults.actuator_faults": "ActuatorBias Fault Stuck",
         "faults.applied_faults": "draw_faults faulty_commands frozen_response",
         "faults.system_faults": "ActuatorGain ParameterDrift ParameterShift SensorBias SensorDrift "
-        "SensorFreeze",
+        "SensorFreeze SensorGain",
         "fmu.twin": "FMUTwin",
         "function": "FunctionTwin",
         "limits": "Limits",

@@ -20,8 +20,7 @@ from retwin.twins.faults.actuator_faults import ends_of
 from retwin.twins.faults.system_faults import (
     ActuatorGain,
     ParameterFault,
-    SensorBias,
-    SensorDrift,
+    SensorError,
     SensorFreeze,
     SizedFault,
     TimedFault,
@@ -223,9 +222,15 @@ class FaultEvidence:
                 commands = np.tile(record.commands, (len(points), 1, 1))
                 commands[..., place] *= 1 + fault.profiles(active, size, onset, self.twin.rate)
                 return Variants(commands=commands), none
-            case SensorBias(output=place) | SensorDrift(output=place):
+            case SensorError(output=place):
                 measured = np.tile(record.measured, (len(points), 1, 1))
-                measured[..., place] -= fault.profiles(active, size, onset, self.twin.rate)
+                error = fault.profiles(active, size, onset, self.twin.rate)
+                if fault.relative:
+                    # Of what is expected from earlier samples: noise is as without the fault.
+                    true = measured.copy()
+                    true[..., place] /= 1 + error
+                    error = error * record.filtered(Variants(measured=true))[0][..., place]
+                measured[..., place] -= error
                 return Variants(measured=measured), none
             case SensorFreeze(output=place):
                 seen = np.tile(record.seen, (len(points), 1, 1))

@@ -212,14 +212,17 @@ class ActuatorGain(SizedFault):
 
 @dataclass(frozen=True)
 class SensorError(SizedFault):
-    """What adds its size to the measurements of one output; see `SensorBias`, `SensorDrift`."""
+    """The base of errors of one output; see `SensorBias`, `SensorDrift` and `SensorGain`."""
 
+    relative: ClassVar[bool] = False
+    """Whether the size is a share of the output; else it is added to it."""
     output: int
 
     def measured(self, outputs: NDArray, rate: float) -> NDArray:
         """The outputs (T, d_y) with the error."""
         made = outputs.copy()
-        made[:, self.output] += self.profile(len(outputs), rate)
+        own = outputs[:, self.output] if self.relative else 1.0
+        made[:, self.output] += own * self.profile(len(outputs), rate)
         return made
 
 
@@ -258,6 +261,33 @@ class SensorDrift(SensorError):
 
 
 @dataclass(frozen=True)
+class SensorGain(SensorError):
+    """A sensor that measures its output times 1 + size: its span is not what it was.
+
+    It acts about zero of the output's unit, as the span of most transmitters does, and not about
+    the mean, which depends on how the machine was used. Where the output hardly varies it is the
+    same as a `SensorBias`. An inversion expects as much noise as without it.
+
+    Parameters
+    ----------
+    output : int
+        The output channel, counted from 0.
+    size : float or (float, float)
+        Relative error, above -1: 0.05 is a sensor that reads 5 % too high.
+    onset, end, label
+        See `TimedFault`.
+
+    """
+
+    relative: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, remedy = ends_of(self.size)[0], "take SensorFreeze where the output has no effect"
+        require(low > -1, "size", expected="more than -1", got=repr(self.size), remedy=remedy)
+
+
+@dataclass(frozen=True)
 class SensorFreeze(TimedFault):
     """A sensor that repeats the sample of the onset.
 
@@ -288,6 +318,7 @@ FAULTS: tuple[type, ...] = (
     ParameterDrift,
     SensorBias,
     SensorDrift,
+    SensorGain,
     SensorFreeze,
 )
 """The kinds of faults that a file may name."""
@@ -306,7 +337,7 @@ def measured_with(observed: NDArray, faults: Faults, rate: float) -> NDArray:
 
 def without_sensor_faults(faults: Faults) -> list[Fault | None]:
     """The faults without those of sensors, which act on what a wrapper makes of the outputs."""
-    sensors = (SensorBias, SensorDrift, SensorFreeze)
+    sensors = (SensorError, SensorFreeze)
     return [None if isinstance(fault, sensors) else fault for fault in faults]
 
 
