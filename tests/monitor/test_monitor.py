@@ -24,6 +24,7 @@ from retwin.twins import (
     ParameterDrift,
     ParameterShift,
     SensorBias,
+    SensorGain,
     State,
     StateTwin,
     Stuck,
@@ -418,6 +419,42 @@ def test_causes_are_any_change_where_no_faults_are_known(
     assert cause.onset[1] - 0.5 < 30.0 < cause.onset[2] + 0.5
     known = {"Healthy": None, "leak": ParameterShift("drain", size=1.0), "stuck": Stuck(0)}
     assert [*possible_causes(monitor.twin, known)] == ["Healthy", "leak"]
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "other"),
+    [
+        (SensorGain(1, size=0.15, onset=30.0), "gain", "offset"),
+        (SensorGain(1, size=-0.15, onset=30.0), "gain", "offset"),
+        (SensorBias(1, size=0.3, onset=30.0), "offset", "gain"),
+    ],
+)
+def test_a_gain_of_a_sensor_differs_from_an_offset_once_the_output_varies(
+    monitor: Monitor, fault: SensorGain | SensorBias, kind: str, other: str
+) -> None:
+    watched, causes = record(1, 5, faults=[fault]), possible_causes(monitor.twin)
+    first, *further = monitor.watch(watched).alarms
+    (early,) = find_causes(monitor.twin, watched, [first], causes)
+    both = [early.probabilities[f"pressure: sensor {each}"] for each in (kind, other)]
+    assert sum(both) > 0.95, "either, until the level has changed"
+    assert max(both) < 0.8
+    later = [next(each for each in further if each.time > 36)]
+    (cause,) = find_causes(monitor.twin, watched, later, causes)
+    assert cause.name == f"pressure: sensor {kind}"
+    assert cause.probability > 0.99
+    assert cause.size[1] < fault.size < cause.size[2]
+    assert cause.unit == ("of the true value" if kind == "gain" else "kPa")
+
+
+def test_larger_noise_of_a_machine_at_rest_is_no_gain_of_a_sensor(monitor: Monitor) -> None:
+    rng, noise = np.random.default_rng(5), np.ones((600, 2))
+    noise[350:, 1] = 2.5
+    still = TANK.simulate(np.zeros((1, 600, 1)), seed=0)
+    watched = still.replace(observed=NOISE * noise * rng.normal(size=(1, 600, 2)))
+    alarm = [each for each in monitor.watch(watched).alarms if each.time > 35][:1]
+    (cause,) = find_causes(monitor.twin, watched, alarm, possible_causes(monitor.twin))
+    assert cause.unknown > 0.9
+    assert cause.probabilities["pressure: sensor gain"] < 0.5
 
 
 def test_a_dead_time_is_no_cause() -> None:

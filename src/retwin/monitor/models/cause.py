@@ -25,7 +25,9 @@ from retwin.twins.faults.system_faults import (
     ParameterShift,
     SensorBias,
     SensorDrift,
+    SensorError,
     SensorFreeze,
+    SensorGain,
     SizedFault,
     TimedFault,
 )
@@ -129,9 +131,11 @@ def size_unit(fault: Fault | None, twin: DynamicsTwin) -> str:
         return f"{own[0]}{' per second' * fault.grows}" if own else ""
     if isinstance(fault, ActuatorGain):
         return "of the command"
-    if isinstance(fault, SensorDrift):
-        return f"{twin.outputs.units[fault.output]}/s"
-    return twin.outputs.units[fault.output] if isinstance(fault, SensorBias) else ""
+    if isinstance(fault, SensorGain):
+        return "of the true value"
+    if isinstance(fault, SensorError):
+        return f"{twin.outputs.units[fault.output]}{'/s' * fault.grows}"
+    return ""
 
 
 def cause_data(
@@ -166,8 +170,11 @@ def possible_causes(
     """What may cause an alarm: the faults that are known, or else any change of the system.
 
     Without known faults these are a shift and a drift of each parameter of the twin within its
-    bounds, another gain of each command, and an offset, a drift and a freeze of each sensor, by up
-    to the range that the output has in calibration, or three of these for an offset.
+    bounds, another gain of each command, and an offset, another gain, a drift and a freeze of each
+    sensor, by up to the range that the output has in calibration, or three of these for an offset.
+    A gain is as many times too low as the largest offset makes the usual level too high, or up to
+    twice as much too high: so its range is no narrower than that of the offset, and the offset is
+    somewhat more probable where both are the same, since the output hardly varies.
 
     Parameters
     ----------
@@ -209,22 +216,23 @@ def _any_change(twin: DynamicsTwin) -> dict[str, TimedFault]:
     for i in np.flatnonzero(moved).tolist():
         name = f"{twin.inputs.names[i]}: another effect"
         made[name] = ActuatorGain(actuator=i, size=(-1.0, 1.0))
-    for i, range_ in enumerate(output_ranges(twin)):
-        name, rate = twin.outputs.names[i], range_ * twin.rate / BEFORE
-        made[f"{name}: sensor offset"] = SensorBias(
-            output=i, size=(-OFFSET * range_, OFFSET * range_)
-        )
+    for i, (level, range_) in enumerate(zip(*output_levels(twin), strict=True)):
+        name, rate, offset = twin.outputs.names[i], range_ * twin.rate / BEFORE, OFFSET * range_
+        gain = offset / level
+        made[f"{name}: sensor offset"] = SensorBias(output=i, size=(-offset, offset))
+        made[f"{name}: sensor gain"] = SensorGain(output=i, size=(-gain / (1 + gain), 2 * gain))
         made[f"{name}: sensor drift"] = SensorDrift(output=i, size=(-rate, rate))
         made[f"{name}: sensor frozen"] = SensorFreeze(output=i)
     return made
 
 
-def output_ranges(twin: DynamicsTwin) -> list[float]:
-    """Widths of uniform distributions of the outputs where states are as in calibration."""
+def output_levels(twin: DynamicsTwin) -> tuple[list[float], list[float]]:
+    """Root mean squares, and widths of uniform distributions, of outputs as in calibration."""
     commands = twin.domain.mean[None, None, len(twin.process) :]
     unseen = np.zeros((1, 1, len(twin.noise)))
-    spread = twin.filter(commands, unseen, unseen.astype(bool), known_start=False)[1][0, 0]
-    return np.sqrt(12 * np.diagonal(spread)).tolist()
+    mean, spread, _ = twin.filter(commands, unseen, unseen.astype(bool), known_start=False)
+    variances = np.diagonal(spread[0, 0])
+    return np.hypot(mean[0, 0], np.sqrt(variances)).tolist(), np.sqrt(12 * variances).tolist()
 
 
 def find_causes(

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.monitor.models.cause import output_ranges, size_unit
+from retwin.monitor.models.cause import output_levels, size_unit
 from retwin.monitor.models.monitor import Monitor
 from retwin.monitor.models.state import SHARE, Visible
 from retwin.progress import Progress, tracked
@@ -30,6 +30,7 @@ from retwin.twins.faults.system_faults import (
     SensorBias,
     SensorError,
     SensorFreeze,
+    SensorGain,
     SizedFault,
     TimedFault,
     measured_with,
@@ -112,8 +113,8 @@ def _value_behind(fault: Fault | None, twin: DynamicsTwin) -> float | None:
         values = dict(zip(twin.equations.names, twin.values.tolist(), strict=True))
         return values.get(fault.parameter)
     if isinstance(fault, SensorBias):
-        return output_ranges(twin)[fault.output]
-    return 1.0 if isinstance(fault, ActuatorGain) else None
+        return output_levels(twin)[1][fault.output]
+    return 1.0 if isinstance(fault, ActuatorGain | SensorGain) else None
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,9 @@ from retwin.twins.faults.system_faults import (
     ParameterShift,
     SensorBias,
     SensorDrift,
+    SensorError,
     SensorFreeze,
+    SensorGain,
 )
 from retwin.update.dynamics.filter.noise import CERTAIN
 
@@ -284,6 +286,9 @@ SENTENCES: Mapping[type, str] = {
     "its supply, its connection, its wear, and whether something limits or overrides the command.",
     SensorBias: "The sensor of {channel} is offset. Compare it with a second instrument, and check "
     "its mounting, its reference and its calibration.",
+    SensorGain: "The sensor of {channel} reads too high or too low in proportion to its value. "
+    "Compare it with a second instrument at a low and at a high value, and check its span and the "
+    "factor by which its signal is scaled.",
     SensorDrift: "The error of the sensor of {channel} grows with time. Compare it with a second "
     "instrument now and again later, and check it for dirt, moisture and ageing.",
     SensorFreeze: "The sensor of {channel} repeats the same value. Check its cable, its bus and "
@@ -308,6 +313,6 @@ def what_to_check(name: str, fault: object, monitor: AnyMonitor) -> str:
     channel = ""
     if isinstance(fault, ActuatorGain):
         channel = monitor.twin.inputs.names[fault.actuator]
-    elif isinstance(fault, SensorBias | SensorDrift | SensorFreeze):
+    elif isinstance(fault, SensorError | SensorFreeze):
         channel = monitor.twin.outputs.names[fault.output]
     return SENTENCES.get(type(fault), UNNAMED).format(fault=fault, channel=channel)
