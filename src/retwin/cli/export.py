@@ -201,12 +201,9 @@ def _steps(text: str) -> tuple[int, ...]:
     try:
         return tuple(int(each) for each in text.split(","))
     except ValueError:
-        raise InputError(
-            "--history",
-            expected="whole numbers of steps, joined by commas",
-            got=repr(text),
-            remedy="give --history 0,1,2",
-        ) from None
+        expected = "whole numbers of steps, joined by commas"
+        remedy = "give --history 0,1,2"
+        raise InputError("--history", expected=expected, got=repr(text), remedy=remedy) from None
 
 
 def _print_actuator(made: ExportedActuator, out: Path, *, as_json: bool) -> None:

@@ -212,13 +212,9 @@ def _method(name: str, loss: str | None, starts: int | None) -> Any:
     taken = {"least_squares": ("loss", "starts"), "evolution": ("loss",), "bayes": ("starts",)}
     for given in options:
         methods = [each for each, names in taken.items() if given in names]
-        require(
-            name in methods,
-            f"--{given}",
-            expected=f"none with --method {name}",
-            got=options[given],
-            remedy=f"leave it out; {' and '.join(methods)} take it",
-        )
+        expected = f"none with --method {name}"
+        remedy = f"leave it out; {' and '.join(methods)} take it"
+        require(name in methods, f"--{given}", expected=expected, got=options[given], remedy=remedy)
     return catalog.resolve(catalog.IDENTIFICATIONS[name].target)(**options)
 
 

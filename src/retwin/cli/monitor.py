@@ -461,13 +461,9 @@ def _named(twin: CorrectedTwin | DynamicsTwin | None) -> TwinData | None:
 def _healthy(record: Trajectories, file: Path) -> Trajectories:
     """The healthy trajectories of a file."""
     chosen = record[record.maybe_healthy]
-    require(
-        len(chosen) > 0,
-        str(file),
-        expected="healthy trajectories",
-        got="faulty ones alone",
-        remedy="a monitor is calibrated on the healthy machine",
-    )
+    expected = "healthy trajectories"
+    remedy = "a monitor is calibrated on the healthy machine"
+    require(len(chosen) > 0, str(file), expected=expected, got="faulty ones alone", remedy=remedy)
     return chosen
 
 

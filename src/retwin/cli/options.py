@@ -111,13 +111,9 @@ def seconds_of(option: str, text: str) -> float | None:
         return None
     found = re.fullmatch(r"\s*((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-z]*)\s*", text)
     value = float(found[1]) * SECONDS.get(found[2], 0.0) if found else 0.0
-    require(
-        0 < value < inf,
-        option,
-        expected="free, or a time above 0 such as 90s, 15min, 2h or 1d",
-        got=text,
-        remedy="a number alone is in seconds",
-    )
+    expected = "free, or a time above 0 such as 90s, 15min, 2h or 1d"
+    remedy = "a number alone is in seconds"
+    require(0 < value < inf, option, expected=expected, got=text, remedy=remedy)
     return value
 
 

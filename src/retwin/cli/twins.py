@@ -247,12 +247,9 @@ def _servo(text: str) -> tuple[str, Any]:
     try:
         stiffness, damping = map(float, gains.split(","))
     except ValueError:
-        raise InputError(
-            "--servo",
-            expected="JOINT=STIFFNESS,DAMPING in N m/rad and N m s/rad",
-            got=repr(text),
-            remedy="write for instance --servo hip=500,40",
-        ) from None
+        expected = "JOINT=STIFFNESS,DAMPING in N m/rad and N m s/rad"
+        remedy = "write for instance --servo hip=500,40"
+        raise InputError("--servo", expected=expected, got=repr(text), remedy=remedy) from None
     return joint, Servo(stiffness, damping)
 
 
@@ -315,12 +312,10 @@ def _sampler(system: Case | None, found: Twin, duration: float | None) -> Any:
         return system.sampler
     limits = getattr(found, "limits", None)
     bounded = limits is not None and all(map(isfinite, limits.low + limits.high))
+    expected = "commands, since not all inputs have limits within which to draw them"
+    remedy = "give --commands FILE, or --case NAME"
     require(
-        bounded or not len(found.inputs),
-        "--commands",
-        expected="commands, since not all inputs have limits within which to draw them",
-        got="none",
-        remedy="give --commands FILE, or --case NAME",
+        bounded or not len(found.inputs), "--commands", expected=expected, got="none", remedy=remedy
     )
     expected = "the duration of a trajectory in seconds, since no case draws commands"
     remedy = "give --duration SECONDS, --commands FILE, or --case NAME"

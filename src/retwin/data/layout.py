@@ -200,13 +200,9 @@ def _by_numbers(lines: Sequence[str], place: str) -> tuple[str, int, Row, Row]:
             count = sum(_is_value(cell, separator != ",") for cell in values)
             # More numbers win; blanks only where nothing else separates.
             found.append(((several, bool(separator), count), separator, first, rows))
-    require(
-        found,
-        place,
-        expected="a table of numbers",
-        got=repr(lines[0].strip()[:60]) if lines else "an empty file",
-        remedy="check that it is the right file",
-    )
+    expected = "a table of numbers"
+    got = repr(lines[0].strip()[:60]) if lines else "an empty file"
+    require(found, place, expected=expected, got=got, remedy="check that it is the right file")
     _, separator, first, rows = max(found, key=lambda each: each[0])
     width = _width(rows, first)
     head = [row[:width] for row in _head(rows[:first], width, place)][-2:]

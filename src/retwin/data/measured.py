@@ -53,17 +53,14 @@ def check_magnitude(argument: str, trajectories: Trajectories, *, ideal: bool = 
     limit = np.where(scale > 0, MAX_RATIO * scale, np.inf).clip(max=MAX_VALUE)
     i, _, k = np.argwhere(size > limit)[:1].T
     usual = "largest ideal output" if ideal else f"{USUAL:.0%} quantile of the output"
-    require(
-        not len(i),
-        f"{argument}.observed",
-        expected=f"measurements below {MAX_RATIO:g} times the {usual}",
-        got=", ".join(
-            f"{size[each, :, at].max():.3g} of {trajectories.outputs.names[at]} "
-            f"in {trajectories.ids[each]}"
-            for each, at in zip(i, k, strict=True)
-        ),
-        remedy="replace the values that stand for a missing measurement by NaN",
+    expected = f"measurements below {MAX_RATIO:g} times the {usual}"
+    got = ", ".join(
+        f"{size[each, :, at].max():.3g} of {trajectories.outputs.names[at]} "
+        f"in {trajectories.ids[each]}"
+        for each, at in zip(i, k, strict=True)
     )
+    remedy = "replace the values that stand for a missing measurement by NaN"
+    require(not len(i), f"{argument}.observed", expected=expected, got=got, remedy=remedy)
 
 
 def unmeasured(trajectories: Trajectories) -> str:

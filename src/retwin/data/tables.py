@@ -191,12 +191,9 @@ def read_titled(path: Path, wanted: Sequence[str]) -> Table:
         layout = text_layout(*begin_of(path), path.name, wanted)
         return _read_columns(path, layout, wanted, empty=True, strict=True)
     except (OSError, UnicodeError) as error:
-        raise InputError(
-            str(path),
-            expected="a table of text",
-            got=getattr(error, "strerror", None) or f"{type(error).__name__}: {brief(error)}",
-            remedy="check the name of the file, and that it is the right one",
-        ) from None
+        got = getattr(error, "strerror", None) or f"{type(error).__name__}: {brief(error)}"
+        remedy = "check the name of the file, and that it is the right one"
+        raise InputError(str(path), expected="a table of text", got=got, remedy=remedy) from None
 
 
 def _read_columns(

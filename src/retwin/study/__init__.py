@@ -191,22 +191,14 @@ def _check_possible(case: Case, plan: StudyPlan) -> None:
         remedy=f"leave it out for the case {case.name!r}",
     )
     package = not_installed(CLASSIFIERS[plan.classifier_name].extra) if case.diagnosed else ""
-    require(
-        not package,
-        "classifier",
-        expected=f"for {plan.classifier_name!r} {package}",
-        got="no such package",
-        remedy="install it, or take another classifier",
-    )
+    expected = f"for {plan.classifier_name!r} {package}"
+    remedy = "install it, or take another classifier"
+    require(not package, "classifier", expected=expected, got="no such package", remedy=remedy)
     for name in plan.sources:
         missing = lacking(name, case, plan)
-        require(
-            not missing,
-            "sources",
-            expected=f"for {name!r} {missing}",
-            got=repr(name),
-            remedy="leave it out, or give 'all' for those that are possible",
-        )
+        expected = f"for {name!r} {missing}"
+        remedy = "leave it out, or give 'all' for those that are possible"
+        require(not missing, "sources", expected=expected, got=repr(name), remedy=remedy)
 
 
 def possible_sources(case: Case, plan: StudyPlan) -> tuple[str, ...]:

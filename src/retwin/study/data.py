@@ -149,13 +149,10 @@ def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories
         for i, j, _ in find_copies(both.measured)
         if j < count <= i
     ]
-    require(
-        not shared,
-        "test",
-        expected="measurements that are in no calibration trajectory",
-        got="; ".join(shared[:3]) + (f"; {len(shared)} in all" if len(shared) > 3 else ""),
-        remedy="leave them out of one of both sets",
-    )
+    expected = "measurements that are in no calibration trajectory"
+    got = "; ".join(shared[:3]) + (f"; {len(shared)} in all" if len(shared) > 3 else "")
+    remedy = "leave them out of one of both sets"
+    require(not shared, "test", expected=expected, got=got, remedy=remedy)
     first = distinct_records(both.measured)
     return both, Roles.of([(first[first < count], first[first >= count])])
 

@@ -77,13 +77,10 @@ class CorrectedTwin(OfTwin):
 
     def started(self, record: Trajectories) -> CorrectedTwin:
         """The twin with the unknown starts of one record; see `DynamicsTwin.started`."""
-        require(
-            self.unknown_starts,
-            "record",
-            expected="a model of a StateTwin with unknown starts",
-            got="one whose starts are known, or cannot be set",
-            remedy="simulate it as it is; bounds make a start unknown",
-        )
+        expected = "a model of a StateTwin with unknown starts"
+        got = "one whose starts are known, or cannot be set"
+        remedy = "simulate it as it is; bounds make a start unknown"
+        require(self.unknown_starts, "record", expected=expected, got=got, remedy=remedy)
         surrogate: Any = self.surrogate
         return replace(self, surrogate=surrogate.started(record))
 

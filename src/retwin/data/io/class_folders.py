@@ -130,12 +130,10 @@ def _read_dataset(
         nominal, observed = both[:, :width], both[:, width:]
         commands, recorded = None, None
     else:
-        raise InputError(
-            where,
-            expected="the variables trajCmds and trajResps, or dataset",
-            got=", ".join(sorted(mat_variables(file, budget, reader))) or "none",
-            remedy="give the folder of the authors' data as it is",
-        )
+        expected = "the variables trajCmds and trajResps, or dataset"
+        got = ", ".join(sorted(mat_variables(file, budget, reader))) or "none"
+        remedy = "give the folder of the authors' data as it is"
+        raise InputError(where, expected=expected, got=got, remedy=remedy)
     fits = len(nominal) == len(observed)
     expected = f"{len(nominal)} samples, as trajCmds"
     remedy = "sample both on the same grid"
@@ -177,13 +175,9 @@ def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None,
         remedy="sample commands and paths on the same grid",
     )
     rates = {round(rate, 3) for _, rate in series if rate is not None}
-    require(
-        len(rates) <= 1,
-        where,
-        expected="one sample rate",
-        got=", ".join(f"{rate:g} Hz" for rate in sorted(rates)),
-        remedy="sample all motors on the same grid",
-    )
+    got = ", ".join(f"{rate:g} Hz" for rate in sorted(rates))
+    remedy = "sample all motors on the same grid"
+    require(len(rates) <= 1, where, expected="one sample rate", got=got, remedy=remedy)
     return np.stack(vectors, axis=1), next(iter(rates), None)
 
 
@@ -202,13 +196,10 @@ def _series(cell: Any, where: str) -> tuple[NDArray | None, float | None]:
     remedy = "repair the Time of the motor commands"
     require(len(times) == len(data) and growing, where, expected=expected, got=got, remedy=remedy)
     # The largest ratio of two sample periods that count as jitter: one sample less makes it 2.
-    require(
-        periods.max() <= 1.5 * periods.min(),
-        where,
-        expected="a constant sample rate",
-        got=f"steps from {periods.min():g} to {periods.max():g} s",
-        remedy="resample the commands",
-    )
+    expected = "a constant sample rate"
+    got = f"steps from {periods.min():g} to {periods.max():g} s"
+    remedy = "resample the commands"
+    require(periods.max() <= 1.5 * periods.min(), where, expected=expected, got=got, remedy=remedy)
     return data, float(1 / np.median(periods))
 
 

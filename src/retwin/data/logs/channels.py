@@ -212,12 +212,10 @@ def signal_of(log: Log, name: str) -> Signal:
     there = [*log.signals, *(other for other, why in log.skipped.items() if why == UNWANTED)]
     alike = difflib.get_close_matches(name, there[:MAX_SIGNALS], n=3, cutoff=0.3)
     others = ", ".join(alike or there[:3]) or "none"
-    raise InputError(
-        log.name,
-        expected=f"the signal {name!r} of the mapping",
-        got=f"it without values ({log.skipped[name]})" if name in log.skipped else others,
-        remedy="name it as the log does; `retwin data map` lists all signals",
-    )
+    expected = f"the signal {name!r} of the mapping"
+    got = f"it without values ({log.skipped[name]})" if name in log.skipped else others
+    remedy = "name it as the log does; `retwin data map` lists all signals"
+    raise InputError(log.name, expected=expected, got=got, remedy=remedy)
 
 
 def in_order(signal: Signal, where: str, *, disorder: float = 10.0) -> tuple[Signal, list[str]]:

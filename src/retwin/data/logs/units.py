@@ -131,12 +131,10 @@ def converted(values: NDArray, source: str, target: str, where: str) -> NDArray:
     offset, slope = float(ends[0]), float(ends[1] - ends[0])
     # Every unit of pint that is no logarithm is a line; the others are refused.
     line = np.isclose(ends[2], offset + 2 * slope, rtol=1e-9, atol=1e-300)
+    expected = f"a unit that is converted to {target!r}, and no logarithm"
+    got = repr(source)
     require(
-        np.isfinite(ends).all() and slope and line,
-        where,
-        expected=f"a unit that is converted to {target!r}, and no logarithm",
-        got=repr(source),
-        remedy=remedy,
+        np.isfinite(ends).all() and slope and line, where, expected=expected, got=got, remedy=remedy
     )
     return offset + slope * values
 

@@ -33,12 +33,9 @@ def command_space(correction: Correction) -> CommandSpace:
     operator = before_sensor(correction)
     if isinstance(operator, CommandSpace):
         return operator
-    raise InputError(
-        "residual",
-        expected="a residual model of the actuators' effective commands",
-        got=repr(correction),
-        remedy="fit it with CommandSpace(), or with a Chain of it and a SampledSensor()",
-    )
+    expected = "a residual model of the actuators' effective commands"
+    remedy = "fit it with CommandSpace(), or with a Chain of it and a SampledSensor()"
+    raise InputError("residual", expected=expected, got=repr(correction), remedy=remedy)
 
 
 def command_problem(

@@ -173,12 +173,10 @@ class StateInversionDiagnoser:
         found, dispersions = zip(*tracked(rows, len(single), progress), strict=True)
         evidence = np.array([[each.evidence for each in row] for row in found])
         if not np.isfinite(evidence).any(axis=1).all():
-            raise ImplausibleError(
-                "trajectories",
-                expected="outputs with which the filter stays finite",
-                got=f"{int((~np.isfinite(evidence).any(axis=1)).sum())} with which it does not",
-                remedy="check their units",
-            )
+            expected = "outputs with which the filter stays finite"
+            got = f"{int((~np.isfinite(evidence).any(axis=1)).sum())} with which it does not"
+            remedy = "check their units"
+            raise ImplausibleError("trajectories", expected=expected, got=got, remedy=remedy)
         parts = np.array([[(e.mean, e.low, e.high) for e in row[:-1]] for row in found])
         size, onset, end = (Estimate(*np.moveaxis(parts[..., k], 2, 0)) for k in range(3))
         top = evidence.max(axis=1, keepdims=True)
@@ -213,12 +211,10 @@ class StateInversionDiagnoser:
         record = FaultEvidence.of(self.twin, trajectory, known_start)
         error = record.largest_error()
         if not error < implausible:
-            raise ImplausibleError(
-                "trajectories",
-                expected="finite outputs that the twin's sensors could measure",
-                got=f"one {error:.1g} standard deviations away in {trajectory.ids[0]}",
-                remedy="check their units, and mask values that stand for missing ones",
-            )
+            expected = "finite outputs that the twin's sensors could measure"
+            got = f"one {error:.1g} standard deviations away in {trajectory.ids[0]}"
+            remedy = "check their units, and mask values that stand for missing ones"
+            raise ImplausibleError("trajectories", expected=expected, got=got, remedy=remedy)
         faults = self.faults.values()
         row = [record.integral(fault) for fault in faults]
         unknown = record.unknown(faults, row)

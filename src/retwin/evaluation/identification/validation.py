@@ -216,13 +216,10 @@ def validate_identification(
         remedy="give what rt.identify returned",
     )
     mean = found.twin.twin if isinstance(found, Posterior) else found.twin
-    require(
-        mean.names == before.names,
-        "before",
-        expected=f"the twin with the parameters {', '.join(mean.names)}",
-        got=", ".join(before.names),
-        remedy="give the twin that was identified, at its values before",
-    )
+    expected = f"the twin with the parameters {', '.join(mean.names)}"
+    got = ", ".join(before.names)
+    remedy = "give the twin that was identified, at its values before"
+    require(mean.names == before.names, "before", expected=expected, got=got, remedy=remedy)
     horizon = found.horizon if isinstance(found, Updated) else float("inf")
     parts: dict[Part, Trajectories] = {"identification": used}
     if held_out is not None:

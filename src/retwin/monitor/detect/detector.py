@@ -104,12 +104,10 @@ class Detector:
     def start(self, streams: int) -> DetectorState:
         """The state before the first sample, and after a reset."""
         count = whole("streams", streams, at_least=1)
+        expected = f"{len(self.which)}, as many as there are slacks"
+        remedy = "give one slack for all streams, or one for each"
         require(
-            len(self.which) in (1, count),
-            "streams",
-            expected=f"{len(self.which)}, as many as there are slacks",
-            got=count,
-            remedy="give one slack for all streams, or one for each",
+            len(self.which) in (1, count), "streams", expected=expected, got=count, remedy=remedy
         )
         return DetectorState(np.zeros((count, len(self.bets.weights))), np.zeros(count))
 
@@ -215,13 +213,10 @@ class Detector:
             got=f"shapes {low.shape} and {top.shape}",
             remedy="start a state for as many streams as there are",
         )
-        require(
-            not np.any(low > top),
-            "score",
-            expected="lower ends of intervals that are not above the upper ones",
-            got="at least one that is",
-            remedy="give what `ConformalScores.score` returns, in its order",
-        )
+        expected = "lower ends of intervals that are not above the upper ones"
+        got = "at least one that is"
+        remedy = "give what `ConformalScores.score` returns, in its order"
+        require(not np.any(low > top), "score", expected=expected, got=got, remedy=remedy)
         return low, top
 
     def factors(

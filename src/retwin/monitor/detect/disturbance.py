@@ -170,13 +170,9 @@ def fit_disturbance(
         folds = np.array_split(np.arange(given.shape[1]), whole("folds", folds, at_least=2))
     fewest = min((seen.sum(axis=1) - seen[:, each].sum(axis=1)).min() for each in folds)
     enough = MIN_RESIDUALS // 2
-    require(
-        fewest >= enough,
-        "residual",
-        expected=f"at least {enough} residuals outside each of {len(folds)} parts of the record",
-        got=str(fewest),
-        remedy="leave out the parts of the record in which nothing was measured",
-    )
+    expected = f"at least {enough} residuals outside each of {len(folds)} parts of the record"
+    remedy = "leave out the parts of the record in which nothing was measured"
+    require(fewest >= enough, "residual", expected=expected, got=str(fewest), remedy=remedy)
     values = ((given - mean[:, None]) / scale[:, None]).T
     blocks = _blocks(values)
     point = _orders(blocks, max_order)

@@ -64,12 +64,9 @@ class Step(BaseModel):
 def check_token(token: str | None) -> str:
     """The token, if it is long enough; another one is an `InputError`."""
     if not isinstance(token, str) or len(token) < MIN_TOKEN_LENGTH or not token.isascii():
-        raise InputError(
-            "token",
-            expected=f"at least {MIN_TOKEN_LENGTH} ASCII characters",
-            got="another one",
-            remedy="make one: python -c 'import secrets; print(secrets.token_urlsafe())'",
-        )
+        expected = f"at least {MIN_TOKEN_LENGTH} ASCII characters"
+        remedy = "make one: python -c 'import secrets; print(secrets.token_urlsafe())'"
+        raise InputError("token", expected=expected, got="another one", remedy=remedy)
     return token
 
 

@@ -75,12 +75,10 @@ def listening(host: str, port: int) -> socket.socket:
         bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return bound
     except (OSError, OverflowError, UnicodeError) as error:
-        raise InputError(
-            "port",
-            expected=f"one of {host} that is free",
-            got=f"{port}: {brief(error)}",
-            remedy="give another one, or 0 for any that is free",
-        ) from None
+        expected = f"one of {host} that is free"
+        got = f"{port}: {brief(error)}"
+        remedy = "give another one, or 0 for any that is free"
+        raise InputError("port", expected=expected, got=got, remedy=remedy) from None
 
 
 @contextmanager

@@ -180,13 +180,11 @@ class Database:
             yield
         except sa.exc.SQLAlchemyError as error:
             cause = getattr(error, "orig", None) or error
-            raise InputError(
-                self.name,
-                expected="a database that stores and reads",
-                got=f"{type(cause).__name__}: {brief(cause)}",
-                remedy="nothing of this step was acknowledged: check its free disk space, its "
-                "rights and its server, and repeat the step",
-            ) from None
+            expected = "a database that stores and reads"
+            got = f"{type(cause).__name__}: {brief(cause)}"
+            remedy = "nothing of this step was acknowledged: check its free disk space, its "
+            remedy += "rights and its server, and repeat the step"
+            raise InputError(self.name, expected=expected, got=got, remedy=remedy) from None
 
     def shrink(self) -> None:
         """Give the pages of removed rows back: to the disk in SQLite, to new rows in PostgreSQL."""
@@ -202,13 +200,10 @@ class Database:
     def _check_schema(self, connection: Any) -> None:
         row = connection.execute(meta.select().where(meta.c.key == "schema")).one_or_none()
         found = row.value if row is not None else str(SCHEMA)
-        require(
-            found == str(SCHEMA),
-            self.name,
-            expected=f"a store of schema {SCHEMA}",
-            got=f"schema {found[:20]}",
-            remedy="open it with the version of retwin that wrote it, or a newer one",
-        )
+        expected = f"a store of schema {SCHEMA}"
+        got = f"schema {found[:20]}"
+        remedy = "open it with the version of retwin that wrote it, or a newer one"
+        require(found == str(SCHEMA), self.name, expected=expected, got=got, remedy=remedy)
 
     def _hold(self) -> None:
         """Take the lock of the process that writes, which ends with the connection.
@@ -224,13 +219,10 @@ class Database:
         self._writer.commit()
         if not held:
             self._drop()
-        require(
-            held,
-            self.name,
-            expected="a store that no other process writes to",
-            got="one that a process writes to now",
-            remedy="wait until it has ended, open it with read_only, or give another database",
-        )
+        expected = "a store that no other process writes to"
+        got = "one that a process writes to now"
+        remedy = "wait until it has ended, open it with read_only, or give another database"
+        require(held, self.name, expected=expected, got=got, remedy=remedy)
 
     def _drop(self) -> None:
         self._writer.invalidate()

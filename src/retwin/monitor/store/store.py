@@ -309,13 +309,10 @@ class Store:
     @contextmanager
     def _writing(self) -> Iterator[Any]:
         """The connection that writes, in a transaction; what is known of it is read again later."""
-        require(
-            not self.read_only,
-            "store",
-            expected="one that was opened to write",
-            got="one that was opened to read only",
-            remedy="open it without read_only",
-        )
+        expected = "one that was opened to write"
+        got = "one that was opened to read only"
+        remedy = "open it without read_only"
+        require(not self.read_only, "store", expected=expected, got=got, remedy=remedy)
         with self.lock:
             try:
                 with self._database.writer() as connection:

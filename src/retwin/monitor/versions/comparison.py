@@ -83,13 +83,10 @@ def compare(store: Store, twin: str, number: int) -> Decision:
     remedy = "promote the first version"
     active = given("versions", registry.active, "an active version", remedy=remedy)
     old, new = (load_monitor(registry.folder(each)) for each in (active.number, number))
-    require(
-        type(old) is type(new),
-        f"version {number}",
-        expected=f"a monitor of {KINDS[type(old)]}, as version {active.number} is",
-        got=f"one of {KINDS[type(new)]}",
-        remedy="reject it, and watch its machine under the name of a new twin",
-    )
+    expected = f"a monitor of {KINDS[type(old)]}, as version {active.number} is"
+    got = f"one of {KINDS[type(new)]}"
+    remedy = "reject it, and watch its machine under the name of a new twin"
+    require(type(old) is type(new), f"version {number}", expected=expected, got=got, remedy=remedy)
     whose, remedy = f"that of version {active.number}", "fit it to records of the same machine"
     agree(f"version {number}", new.twin, old.twin, whose, remedy=remedy)
     first = registry.reference

@@ -127,22 +127,14 @@ def decide(
         remedy="score both versions on the same samples",
     )
     present = np.isfinite(old) & np.isfinite(new)
-    require(
-        (present | np.isnan(old)).all(),
-        "crps",
-        expected="finite scores, NaN where a sample is missing",
-        got="infinite ones",
-        remedy="find out which samples have such predictions",
-    )
+    expected = "finite scores, NaN where a sample is missing"
+    got = "infinite ones"
+    remedy = "find out which samples have such predictions"
+    require((present | np.isnan(old)).all(), "crps", expected=expected, got=got, remedy=remedy)
     fewest = int(present.sum(axis=1).min(initial=old.shape[1])) if len(old) else 0
     least = MIN_SAMPLES if len(old) < MIN_RECORDS else 1
-    require(
-        fewest >= least,
-        "crps",
-        expected=f"at least {least} samples of each record",
-        got=fewest,
-        remedy="collect more samples",
-    )
+    expected = f"at least {least} samples of each record"
+    require(fewest >= least, "crps", expected=expected, got=fewest, remedy="collect more samples")
     difference = (old - new)[:, :, None]
     draws = bootstrap_means(difference, draws=DRAWS, seed=seed)
     mean = float(np.nanmean(difference, axis=1).mean())

@@ -183,14 +183,10 @@ class Registry:
             if self.active is None:
                 return self._step("promote", number, first=True)
             decision = instance("evidence", evidence, Decision, remedy="compare both with decide()")
-            require(
-                decision.better,
-                "evidence",
-                expected="a difference in CRPS whose 95 % interval is above 0, and alarms as "
-                "promised",
-                got=decision.summary,
-                remedy="keep the active version, or collect more samples",
-            )
+            expected = "a difference in CRPS whose 95 % interval is above 0, and alarms as promised"
+            got = decision.summary
+            remedy = "keep the active version, or collect more samples"
+            require(decision.better, "evidence", expected=expected, got=got, remedy=remedy)
             return self._step("promote", number, evidence=asdict(decision))
 
     def rollback(self, reason: str = "") -> Version:
@@ -283,13 +279,10 @@ class Registry:
                     _copy_file(file, part / file.relative_to(source))
                 for folder in (part, *(each for each in part.rglob("*") if each.is_dir())):
                     _flush(folder)
-                require(
-                    sha256(part) == digest,
-                    "folder",
-                    expected="a folder that does not change",
-                    got=f"{source}, which changed while it was copied",
-                    remedy="propose it again",
-                )
+                expected = "a folder that does not change"
+                got = f"{source}, which changed while it was copied"
+                remedy = "propose it again"
+                require(sha256(part) == digest, "folder", expected=expected, got=got, remedy=remedy)
         _flush(place.parent)
         _flush(self._store.folder)
         return digest

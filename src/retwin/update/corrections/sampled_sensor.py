@@ -83,14 +83,10 @@ class SampledSensor:
             and 0 <= (self.glitch_probability or 0.0) <= 1
             and all(len(q) > 1 and sorted(q) == list(q) for q in self.noise or ())
         )
-        require(
-            sound,
-            "sensor",
-            expected="a period in seconds above 0, phases from 0 to below it, finite sizes of "
-            "at least 0, rising quantiles and a probability from 0 to 1",
-            got=repr(self),
-            remedy="leave out what you do not know: it is fitted from data",
-        )
+        expected = "a period in seconds above 0, phases from 0 to below it, finite sizes of "
+        expected += "at least 0, rising quantiles and a probability from 0 to 1"
+        remedy = "leave out what you do not know: it is fitted from data"
+        require(sound, "sensor", expected=expected, got=repr(self), remedy=remedy)
 
     def timing(self, rate: float) -> tuple[int, tuple[int, ...] | None]:
         """Sampling period and phases in time steps at `rate` in Hz, where a period is given.

@@ -94,13 +94,10 @@ def without_discrepancy(
     starts = np.tile(unknowns.start[unknowns.free], (len(observed), 1))
     estimation = Estimation(base, observed, unknowns, observed.mask, np.ones(len(base.outputs)))
     found = estimation.linearised(Point(unknowns.mean, starts))
-    require(
-        found.finite,
-        "twin",
-        expected="a simulation of the commands that is finite",
-        got="one that is not, at the present parameters",
-        remedy="identify the twin first, or choose other starts of its parameters",
-    )
+    expected = "a simulation of the commands that is finite"
+    got = "one that is not, at the present parameters"
+    remedy = "identify the twin first, or choose other starts of its parameters"
+    require(found.finite, "twin", expected=expected, got=got, remedy=remedy)
     for _ in range(ERROR_STEPS):
         estimation = replace(estimation, variance=estimation.power(found.residual))
         found = estimation.minimised(_with_best_delays(estimation, found))

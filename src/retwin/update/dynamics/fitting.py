@@ -223,20 +223,14 @@ def _check_samples(observed: Trajectories, parameters: int) -> None:
     """Refuse an output that was never measured, and fewer samples than parameters."""
     names = observed.outputs.names
     missing = [name for i, name in enumerate(names) if not observed.mask[..., i].any()]
-    require(
-        not missing,
-        "observed",
-        expected="measured samples of every output",
-        got=f"none of {', '.join(missing)}",
-        remedy="leave that output out of the twin and of the record, since its noise is unknown",
-    )
-    require(
-        observed.mask.sum() > parameters,
-        "observed",
-        expected="more measured samples than parameters",
-        got=int(observed.mask.sum()),
-        remedy="give more or longer trajectories, or free fewer parameters",
-    )
+    expected = "measured samples of every output"
+    got = f"none of {', '.join(missing)}"
+    remedy = "leave that output out of the twin and of the record, since its noise is unknown"
+    require(not missing, "observed", expected=expected, got=got, remedy=remedy)
+    expected = "more measured samples than parameters"
+    got = str(observed.mask.sum())
+    remedy = "give more or longer trajectories, or free fewer parameters"
+    require(observed.mask.sum() > parameters, "observed", expected=expected, got=got, remedy=remedy)
 
 
 def assembled(

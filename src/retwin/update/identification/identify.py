@@ -318,14 +318,11 @@ def _samples_of(horizon: float | None, twin: ParametricTwin, observed: Trajector
     """The samples of a horizon that is given; None for one to be chosen, or for whole records."""
     if horizon is None or horizon == np.inf:
         return None
-    require(
-        state_based(twin),
-        "horizon",
-        expected="none for a twin without states",
-        got=f"{horizon:g} s for a {type(twin).__name__}",
-        remedy="starts of windows can only be estimated where the equations of the states are "
-        "known: write them as a StateTwin, or leave the horizon out",
-    )
+    expected = "none for a twin without states"
+    got = f"{horizon:g} s for a {type(twin).__name__}"
+    remedy = "starts of windows can only be estimated where the equations of the states are "
+    remedy += "known: write them as a StateTwin, or leave the horizon out"
+    require(state_based(twin), "horizon", expected=expected, got=got, remedy=remedy)
     longest = observed.steps / observed.rate
     require(
         2 / observed.rate <= horizon <= longest,

@@ -169,13 +169,10 @@ def fit_residual(
             context = replace(context, nominal=torch.as_tensor(exact.fitted_outputs(used)))
         warn_of_error(context, used)
         correction, found = fit_correction(correction, context, *_measured(used))
-    require(
-        found.identified.any(),
-        "calibration",
-        expected="measurements that identify the discrepancy",
-        got=f"{int(used.mask.all(axis=2).sum())} samples with all outputs measured",
-        remedy="check the mask; leave an output out that is never measured",
-    )
+    expected = "measurements that identify the discrepancy"
+    got = f"{int(used.mask.all(axis=2).sum())} samples with all outputs measured"
+    remedy = "check the mask; leave an output out that is never measured"
+    require(found.identified.any(), "calibration", expected=expected, got=got, remedy=remedy)
     task = ResidualTask(used, correction, context, found, bounds, seed, progress)
     if isinstance(density, StationaryNoise):
         model: Residual[Any] = fit_stationary(task, density)
@@ -289,12 +286,9 @@ def calibrating(
     elif calibrate_on in ("healthy", "all"):
         keep = (labels == HEALTHY) | (calibrate_on == "all")
     else:
-        raise InputError(
-            "calibrate_on",
-            expected="'healthy', 'all', or a mapping from label to fault",
-            got=repr(calibrate_on),
-            remedy="'all' lets the offset absorb faults; use it for comparison only",
-        )
+        expected = "'healthy', 'all', or a mapping from label to fault"
+        remedy = "'all' lets the offset absorb faults; use it for comparison only"
+        raise InputError("calibrate_on", expected=expected, got=repr(calibrate_on), remedy=remedy)
     wanted = repr(HEALTHY) if isinstance(calibrate_on, str) else ", ".join(calibrate_on)
     require(
         keep.any(),

@@ -42,13 +42,10 @@ def other_machines(
         len(models), "prior", expected="models of other machines", got="none", remedy="name one"
     )
     operator = before_sensor(correction)
-    require(
-        isinstance(operator, CommandSpace),
-        "prior",
-        expected="a correction with CommandSpace, alone or before a SampledSensor",
-        got=f"{type(operator).__name__}, which learns nothing that machines have in common",
-        remedy="leave the prior out, or correct in command space",
-    )
+    expected = "a correction with CommandSpace, alone or before a SampledSensor"
+    got = f"{type(operator).__name__}, which learns nothing that machines have in common"
+    remedy = "leave the prior out, or correct in command space"
+    require(isinstance(operator, CommandSpace), "prior", expected=expected, got=got, remedy=remedy)
     shown = []
     for each in models:
         model, name = _residual(each)

@@ -98,13 +98,8 @@ class Residual(nn.Module, ABC, Generic[D]):
         suits = getattr(correction, "resolution", "") == self.resolution
         if suits and self.resolution == "step":
             suits = all(each.kind == "mixture" for each in correction.heads(inputs, outputs))
-        require(
-            suits,
-            "correction",
-            expected=self.wanted,
-            got=repr(correction),
-            remedy=self.remedy,
-        )
+        expected = self.wanted
+        require(suits, "correction", expected=expected, got=repr(correction), remedy=self.remedy)
         self.latent = correction.latent(inputs, outputs)
         self.sizes = [head.width for head in correction.heads(inputs, outputs)]
         self.degrees = [math.inf] * len(self.sizes)

@@ -159,13 +159,10 @@ def _require_samples(mask: Tensor) -> None:
     empty = ~mask.all(dim=-1).any(dim=1)
     index = empty.nonzero()[:, 0].tolist()
     several = len(index) > 1
-    require(
-        not index or not mask.any(),
-        "mask",
-        expected="in every trajectory at least one sample at which all outputs are measured",
-        got=f"none in {'trajectories' if several else 'trajectory'} {', '.join(map(str, index))}",
-        remedy=f"leave {'them' if several else 'it'} out, or correct the mask",
-    )
+    expected = "in every trajectory at least one sample at which all outputs are measured"
+    got = f"none in {'trajectories' if several else 'trajectory'} {', '.join(map(str, index))}"
+    remedy = f"leave {'them' if several else 'it'} out, or correct the mask"
+    require(not index or not mask.any(), "mask", expected=expected, got=got, remedy=remedy)
 
 
 def _empty(problem: CommandProblem) -> Discrepancy:

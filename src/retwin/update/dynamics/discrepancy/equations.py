@@ -419,13 +419,9 @@ def correctable(twin: StateTwin, wanted: Sequence[str]) -> tuple[str, ...]:
     found = tuple(wanted) or tuple(
         name for i, name in enumerate(names) if not _is_definition(twin, i)
     )
-    require(
-        found,
-        "states",
-        expected="a state equation that can be wrong",
-        got="equations without parameters and commands",
-        remedy="name the states whose equations are to be corrected",
-    )
+    got = "equations without parameters and commands"
+    remedy = "name the states whose equations are to be corrected"
+    require(found, "states", expected="a state equation that can be wrong", got=got, remedy=remedy)
     return found
 
 
