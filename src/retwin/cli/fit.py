@@ -41,8 +41,7 @@ Correction = Annotated[
 ]
 Compare = Annotated[bool, rare("", "Compare candidates.", "--compare/--no-compare")]
 Yardstick = Annotated[
-    bool | None,
-    rare("", "Add models without a twin.", "--yardstick/--no-yardstick"),
+    bool | None, rare("", "Add models without a twin.", "--yardstick/--no-yardstick")
 ]
 TwinSet = Annotated[Path | None, rare("FILE", "Trajectories of the twin; else simulated.")]
 Simulations = Annotated[int | None, rare("N", "Trajectories simulated; else the case's.")]
@@ -53,8 +52,7 @@ Network = Annotated[
     rare("NAME", "Of a surrogate: mlp, lstm, tcn or state_space.", names=catalog.NETWORKS),
 ]
 Density = Annotated[
-    str | None,
-    rare("NAME", "mixture, flow or sequence_mixture.", names=catalog.DENSITIES),
+    str | None, rare("NAME", "mixture, flow or sequence_mixture.", names=catalog.DENSITIES)
 ]
 Prior = Annotated[list[Path] | None, option("FOLDER", "Models of other such machines.")]
 Refine = Annotated[bool, rare("", "Fine-tune on outputs afterwards.", "--refine")]

@@ -41,12 +41,7 @@ UNRATED = (".fmu", ".xml", ".urdf")
 
 
 TwinName = Annotated[
-    str,
-    argument(
-        "TWIN",
-        "*.fmu, *.xml, module:object, or a case.",
-        autocompletion=complete_twins,
-    ),
+    str, argument("TWIN", "*.fmu, *.xml, module:object, or a case.", autocompletion=complete_twins)
 ]
 LogFiles = Annotated[list[Path], argument("LOG…", "Tables *.csv, or what rt.load reads.")]
 Out = Annotated[Path, option("FOLDER", "Where the results go.")]
@@ -61,13 +56,7 @@ HoldOut = Annotated[float | None, option("X", "Share held out; else 0.25.")]
 Loss = Annotated[str | None, rare("NAME", "soft_l1 (default), linear or cauchy.")]
 Starts = Annotated[int | None, rare("N", "Starts of the search; else 4.", min=1, max=1000)]
 SensorRate = Annotated[float | None, rare("HZ", "True rate of the sensor, if lower.")]
-Horizon = Annotated[
-    str,
-    rare(
-        "SECONDS",
-        "Windows to predict, or free.",
-    ),
-]
+Horizon = Annotated[str, rare("SECONDS", "Windows to predict, or free.")]
 Processes = Annotated[int, rare("N", "Worker processes.", min=1, max=256)]
 Column = Annotated[list[str] | None, rare("CHANNEL=NAME", "Column of a channel named otherwise.")]
 Time = Annotated[str | None, rare("NAME", "Column of the times; NAME=ms, us, ns, iso.")]

@@ -175,13 +175,7 @@ def evaluate(
         _note_start(updated, records, begin)
     unstable = [] if ahead else unstable_remarks(model)
     scores = score_model(
-        updated,
-        records,
-        horizon=ahead,
-        warm_up=begin,
-        started=begin,
-        twin=system.twin,
-        seed=seed,
+        updated, records, horizon=ahead, warm_up=begin, started=begin, twin=system.twin, seed=seed
     )
     if out is not None:
         found = predict_records(updated, records, horizon=ahead, started=begin, seed=seed)
@@ -239,11 +233,7 @@ def _begin_of(records: Trajectories) -> float:
 
 
 def _start_remarks(
-    model: Twin,
-    records: Trajectories,
-    usual: list[ModelScore],
-    units: dict[str, str],
-    seed: int,
+    model: Twin, records: Trajectories, usual: list[ModelScore], units: dict[str, str], seed: int
 ) -> list[str]:
     """Outputs that are predicted much better from starts that the records themselves give."""
     from retwin.evaluation import score_model

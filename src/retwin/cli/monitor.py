@@ -82,8 +82,7 @@ app = Commands(
 @app.command(epilog=example("retwin monitor fit model healthy.npz --out watch"))
 def fit(
     files: Annotated[
-        list[Path],
-        argument("FILE...", "A model, unless there is no twin, and healthy records."),
+        list[Path], argument("FILE...", "A model, unless there is no twin, and healthy records.")
     ],
     out: Annotated[Path, option("FOLDER", "Where to save the monitor.")],
     false_alarms: Annotated[

@@ -86,8 +86,7 @@ Horizon = Annotated[
 ]
 
 WarmUp = Annotated[
-    str,
-    option("TIME", "Begin of each record that gives its start, not scored: 5s.", "--warm-up"),
+    str, option("TIME", "Begin of each record that gives its start, not scored: 5s.", "--warm-up")
 ]
 
 

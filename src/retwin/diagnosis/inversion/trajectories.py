@@ -227,11 +227,7 @@ class InversionDiagnoser:
     @torch.no_grad()
     @one_thread()
     def diagnose(
-        self,
-        trajectories: Trajectories,
-        *,
-        max_faults: int = 1,
-        progress: Progress | None = None,
+        self, trajectories: Trajectories, *, max_faults: int = 1, progress: Progress | None = None
     ) -> Diagnosis:
         """Probabilities and severities of every class; all classes are equally probable beforehand.
 

@@ -174,9 +174,7 @@ class Validity:
         value = np.sqrt(self.arl / np.maximum(state.length, 1)) / 2
         runs = np.minimum(state.runs * np.minimum(value, MAX_PER_ALARM), LARGEST)
         return replace(
-            state,
-            runs=np.where(alarm, runs, state.runs),
-            length=np.where(alarm, 0.0, state.length),
+            state, runs=np.where(alarm, runs, state.runs), length=np.where(alarm, 0.0, state.length)
         )
 
     def _with_blocks(self, state: ValidityState, full: NDArray) -> ValidityState:

@@ -275,9 +275,7 @@ class Estimation:
             slope = self.absorbed(at.point.shared)[1]
             shared = shared + slope.T @ slope
         arrow = Arrow(
-            shared,
-            own[..., :parameters] @ unknowns.matrix,
-            own[..., parameters + unknowns.free],
+            shared, own[..., :parameters] @ unknowns.matrix, own[..., parameters + unknowns.free]
         )
         return arrow.plus(self._prior[1])
 

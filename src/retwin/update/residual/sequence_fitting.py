@@ -87,11 +87,7 @@ def fit_sequence(task: ResidualTask, density: SequenceMixture) -> SequenceResidu
 
 
 def _train_members(
-    model: SequenceResidual,
-    data: _Records,
-    fitted: Tensor,
-    seed: int,
-    progress: Progress | None,
+    model: SequenceResidual, data: _Records, fitted: Tensor, seed: int, progress: Progress | None
 ) -> Fit:
     """Train all members together to the last epoch on their samples `fitted` (K, n, T).
 
