@@ -261,8 +261,6 @@ def _start_remarks(
 
 MUCH = 0.8
 """Ratio of errors from which starts of records are named."""
-HARDLY = 0.02
-"""Part of an error by which an update must lower it, not to be called one of bands alone."""
 FOREIGN, NOTHING = 2.0, 0.05
 """Ratio of the error to the spread of a record from which, and share inside the band below which, a
 record may be of another channel or machine."""
@@ -286,8 +284,15 @@ def _foreign(scores: list[ModelScore]) -> list[str]:
     ]
 
 
-def _verdict(scores: list[ModelScore], *, started: bool = False) -> list[str]:
-    """What is better than the model, and whether its bands hold, in sentences."""
+def _verdict(scores: list[ModelScore], *, started: bool = False, hardly: float = 0.02) -> list[str]:
+    """What is better than the model, and whether its bands hold, in sentences.
+
+    Parameters
+    ----------
+    hardly : float, default 0.02
+        Part of an error by which an update must lower it, not to be called one of bands alone.
+
+    """
     from retwin.scores.uses import COVERAGE
     from retwin.update.forecast_errors import LEVEL, USUAL
 
@@ -309,9 +314,9 @@ def _verdict(scores: list[ModelScore], *, started: bool = False) -> list[str]:
                     f"{each.output}: {words[each.who]} is a better prediction, by RMSE: "
                     f"{each.rmse:.3g} in place of {model.rmse:.3g}."
                 )
-            elif each.who == "twin" and model.rmse > (1 - HARDLY) * each.rmse and not each.horizon:
+            elif each.who == "twin" and model.rmse > (1 - hardly) * each.rmse and not each.horizon:
                 made.append(
-                    f"{each.output}: the RMSE is that of {words['twin']} within {HARDLY:.0%}: the "
+                    f"{each.output}: the RMSE is that of {words['twin']} within {hardly:.0%}: the "
                     "update adds bands alone there."
                 )
         elif each.coverage < COVERAGE[0]:

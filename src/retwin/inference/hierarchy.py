@@ -35,8 +35,6 @@ TIED = FREEDOM * 2.0 ** np.arange(6)
 probable beforehand: the more, the more alike these variances are."""
 TOLERANCE = 1e-3
 """Relative change of all variances below which they have converged."""
-MAX_STEPS = 200
-"""Steps of expectation-maximisation at most."""
 LARGEST = 1e3
 """Largest standard deviation, in units: what outputs hardly show is linear no further."""
 JITTER = 1e-13
@@ -234,10 +232,17 @@ class Hierarchy:
         """(G,) variances of x about the regression, under conditions that have no replicate."""
         return self.variance + self.common
 
-    def learned(self, design: Design, likelihood: Likelihood) -> Hierarchy:
-        """The most probable hyperparameters for the linearised problem."""
+    def learned(self, design: Design, likelihood: Likelihood, *, max_steps: int = 200) -> Hierarchy:
+        """The most probable hyperparameters for the linearised problem.
+
+        Parameters
+        ----------
+        max_steps : int, default 200
+            Steps of expectation-maximisation at most.
+
+        """
         found = self
-        for _ in range(MAX_STEPS):
+        for _ in range(max_steps):
             before, found = found, found._step(design, likelihood)
             if (found.total() / before.total()).log().abs().amax() < TOLERANCE:
                 break

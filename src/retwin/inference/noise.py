@@ -19,12 +19,8 @@ from retwin.inference.problem import Problem
 
 HEAVY_TAILED = StudentT()
 """The loss of noise by default: glitches hardly count."""
-MAX_CORRELATION = 0.95
-"""Largest lag-one autocorrelation that is learned: beyond it the estimate is too uncertain."""
 LEVELS = 201
 """Levels of noise at which the common error of rounded values is computed, and terms of its sum."""
-SMALLEST_SHARE = 1e-6
-"""Smallest scale relative to the largest one: it keeps exact outputs from infinite weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +99,8 @@ class Noise:
         rounding: tuple[float, ...] = (),
         variance: Tensor | float = 0.0,
         floor: float = 1e-18,
+        max_correlation: float = 0.95,
+        smallest_share: float = 1e-6,
     ) -> Noise:
         """The noise that makes residuals most probable: one step of maximisation.
 
@@ -126,6 +124,11 @@ class Noise:
             (R, K, d), the posterior variance of the predicted outputs.
         floor : float
             Smallest scale, in the residual's unit.
+        max_correlation : float, default 0.95
+            Largest lag-one autocorrelation that is learned: beyond it the estimate is too
+            uncertain.
+        smallest_share : float, default 1e-6
+            Smallest scale relative to the largest one: it keeps exact outputs from infinite weight.
 
         """
         weights = self.weights(problem, residual)[..., None]
@@ -148,12 +151,12 @@ class Noise:
             variances = variances.clamp_min(lattice)
             scale.append((variances if len(self.scale[k]) > 1 else variances.mean(0, True)).sqrt())
             kept = residual / self.scale[k] * (weights * part).sqrt()
-            time = correlation_time(kept, seen, rows=False, limit=MAX_CORRELATION)
+            time = correlation_time(kept, seen, rows=False, limit=max_correlation)
             # Exact outputs have a scale of 0.
             share = (shared / scale[-1].square().mean().clamp_min(1e-300)).clamp_min(common)
             thinning.append(time + share * seen.sum() / blocks)
         scales = torch.stack(scale)
-        smallest = max(floor, SMALLEST_SHARE * float(scales.amax()))
+        smallest = max(floor, smallest_share * float(scales.amax()))
         return Noise(scales.clamp_min(smallest), torch.stack(thinning), self.loss)
 
 

@@ -22,16 +22,12 @@ from retwin.inference.normal import compiled_objective, compiled_step
 from retwin.inference.priors import GaussianPrior, inverse
 from retwin.inference.problem import Problem, Rows
 
-TOLERANCE = 1e-4
-"""Predicted decrease of the objective, in nats, below which a row has converged."""
 MAX_STEPS = 25
 """Gauss-Newton steps at most."""
 REWEIGHTINGS = 3
 """Times that samples are weighted anew within a step: cheap beside a call of the surrogate."""
 DAMPING = 1e-6
 """Damping to begin with, relative to the diagonal of the curvature: next to none."""
-DAMPING_AFTER_FAILURE = 1e-3
-"""Damping at least, after a step that did not decrease the objective."""
 ALIGNED = 0.9
 """Cosine of the angle between successive moves above which they are extrapolated."""
 LARGEST_RATIO = 0.8
@@ -205,6 +201,8 @@ def solve(
     bounds: Bounds | None = None,
     minimum_evidence: Tensor | None = None,
     reweightings: int = REWEIGHTINGS,
+    tolerance: float = 1e-4,
+    damping_after_failure: float = 1e-3,
 ) -> Solution:
     """The most probable latent variables, from `start` (R, P) on.
 
@@ -225,6 +223,10 @@ def solve(
     reweightings : int
         Times that samples are weighted anew within a step, at least 1: fewer where the Jacobian
         costs less than that.
+    tolerance : float, default 1e-4
+        Predicted decrease of the objective, in nats, below which a row has converged.
+    damping_after_failure : float, default 1e-3
+        Damping at least, after a step that did not decrease the objective.
 
     """
     x, linearised = start, problem.linearised(start)
@@ -239,7 +241,7 @@ def solve(
         how: Any = {"damping": damping, "bounds": bounds, "reweightings": reweightings}
         step = gauss_newton_step(problem, prior, noise, x, linearised, **how)
         occam = 0.5 * (prior.log_determinant - step.log_determinant)
-        done = (energy - step.objective < TOLERANCE) | (count == MAX_STEPS)
+        done = (energy - step.objective < tolerance) | (count == MAX_STEPS)
         if minimum_evidence is not None and count:
             hopeless = (occam - step.objective <= minimum_evidence[rows]) & (damping <= DAMPING)
         else:
@@ -278,7 +280,7 @@ def solve(
             )
             tried = residual, jacobian
         linearised = tried
-        raised = (8 * damping).clamp(DAMPING_AFTER_FAILURE, 1e6)
+        raised = (8 * damping).clamp(damping_after_failure, 1e6)
         raised = torch.where(factor > 1, damping, raised)
         damping = torch.where(better, (damping / 4).clamp_min(1e-9), raised)
         before = torch.where(better[:, None], move, 0.0)

@@ -37,8 +37,6 @@ MANY_OUTPUTS = 6
 """Number of outputs beyond which one pair of bars stands for all of them."""
 SEGMENTS = 10
 """Number of segments below which no range of them is shown."""
-MOSTLY = 0.5
-"""The share of a trajectory that was measured, at least, if none was measured completely."""
 BAR = 0.38
 """Width of a bar; groups of bars are 1 apart."""
 
@@ -163,8 +161,15 @@ def picture(study: Study) -> Figure | None:
     return Figure("summary", panels, keys, columns=2)
 
 
-def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
-    """The healthy test trajectory with the median error, in the output with the largest one."""
+def _trajectory(study: Study, pair: tuple[str, str], *, mostly: float = 0.5) -> Panel | None:
+    """The healthy test trajectory with the median error, in the output with the largest one.
+
+    Parameters
+    ----------
+    mostly : float, default 0.5
+        The share of a trajectory that was measured, at least, if none was measured completely.
+
+    """
     overlay, portrait = study.results.overlay, study.portrait
     if overlay is None or overlay.source != pair[0] or not portrait:
         return None
@@ -172,7 +177,7 @@ def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
     nominal, observed, times, bands = (portrait[name] for name in names)
     chosen = partial(median_error_trajectory, nominal, observed, times, study.overlaid_healthy)
     # Where no healthy trajectory is complete, one of which most was measured.
-    place = chosen() if chosen() is not None else chosen(at_least=MOSTLY)
+    place = chosen() if chosen() is not None else chosen(at_least=mostly)
     if place is None:
         return None
     outputs = study.results.outputs

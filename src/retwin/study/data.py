@@ -19,9 +19,6 @@ from retwin.study.files import Roles
 from retwin.study.plan import StudyPlan
 from retwin.update.corrected import generate
 
-EMULATED_PER_CLASS = 10
-"""Emulated trajectories per class where there are no real ones: 90 for the arm, as measured."""
-
 
 @dataclass(frozen=True)
 class StudyData:
@@ -117,12 +114,19 @@ def real_data(
     return real, Roles.of((first[fit], first[test]) for fit, test in folds)
 
 
-def _emulate(case: Case, healthy: int, seed: int) -> Trajectories:
-    """Few runs of each fault, and so many healthy ones."""
+def _emulate(case: Case, healthy: int, seed: int, *, emulated_per_class: int = 10) -> Trajectories:
+    """Few runs of each fault, and so many healthy ones.
+
+    Parameters
+    ----------
+    emulated_per_class : int, default 10
+        Emulated trajectories per class where there are no real ones: 90 for the arm, as measured.
+
+    """
     first, second = np.random.SeedSequence(seed).spawn(2)
     seeds = [int(each.generate_state(1)[0]) for each in (first, second)]
     emulator: Any = case.emulator
-    faulty = generate(emulator, case, per_class=EMULATED_PER_CLASS, seed=seeds[0])
+    faulty = generate(emulator, case, per_class=emulated_per_class, seed=seeds[0])
     if not case.diagnosed:
         return faulty
     faulty = faulty[faulty.labels != HEALTHY]

@@ -22,8 +22,6 @@ from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.windows import simulated as simulated_outputs
 from retwin.update.forecasts import started_moments
 
-CLEAR = 0.5
-"""Ratio of residuals from which exchanged commands are named."""
 UNEXPLAINED = 0.1
 """Share of the variance that a twin leaves, below which commands are in their places."""
 DIVERGED = 1e100
@@ -74,8 +72,15 @@ def simulated(twin: Twin, records: Trajectories) -> NDArray | None:
     return made if np.all(np.abs(made, dtype=float) < DIVERGED) else None
 
 
-def _find_exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
-    """Pairs of commands with which the twin explains more where they are exchanged."""
+def _find_exchanged(twin: Twin, records: Trajectories, *, clear: float = 0.5) -> Iterator[Finding]:
+    """Pairs of commands with which the twin explains more where they are exchanged.
+
+    Parameters
+    ----------
+    clear : float, default 0.5
+        Ratio of residuals from which exchanged commands are named.
+
+    """
     healthy = records[records.maybe_healthy] if records.maybe_healthy.any() else records
     here, names = _unexplained_share(healthy), records.inputs.names
     if here < UNEXPLAINED:
@@ -90,7 +95,7 @@ def _find_exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
         if ideal is None:
             continue
         there = _unexplained_share(other.replace(nominal=ideal))
-        if there < min(CLEAR * here, CLEAR):
+        if there < min(clear * here, clear):
             text = f"seems to be exchanged with {names[b]}: its twin explains {1 - there:.0%} of "
             text += f"the variance that way, {1 - here:.0%} as they are"
             yield Finding("", names[a], "exchanged", text)

@@ -39,10 +39,6 @@ LEADS = (1, 3, 10, 30, 100)
 """Samples ahead at which errors are calibrated."""
 BEGIN = 10
 """The begin of a record is its part by this number."""
-DRIFT = 0.01
-"""Probability of a trend of errors over the time in a record that is no chance."""
-FORGOTTEN = 5.0
-"""Correlation times of errors after which one of them is forgotten."""
 
 
 def free_moments(twin: Twin, commands: NDArray, *, seed: int = 0) -> tuple[NDArray, NDArray]:
@@ -229,7 +225,7 @@ def values_of(records: Trajectories) -> NDArray:
 
 
 def calibrate_forecasts(
-    records: Trajectories, found: Sequence[LeftOut], leads: Sequence[int]
+    records: Trajectories, found: Sequence[LeftOut], leads: Sequence[int], *, forgotten: float = 5.0
 ) -> ForecastErrors:
     """The errors of predictions, from parts of records that the models were not fitted to.
 
@@ -245,6 +241,8 @@ def calibrate_forecasts(
         The parts.
     leads : sequence of int
         Samples ahead of the predictions.
+    forgotten : float, default 5.0
+        Correlation times of errors after which one of them is forgotten.
 
     """
     inner = [each for each in found if not each.edge]
@@ -252,7 +250,7 @@ def calibrate_forecasts(
     channels = range(len(records.outputs))
     rows = [[_calibrate(pairs, channel) for channel in channels] for pairs in errors]
     persistence, deviation, independent, correlation = np.moveaxis(np.array(rows), 2, 0)
-    memory = float(FORGOTTEN * correlation[-1].max() / records.rate)
+    memory = float(forgotten * correlation[-1].max() / records.rate)
     started = _calibrate_started(inner)
     held = [each.excess for each in found if _hold_all(each, deviation[-1], started)]
     beyond = np.maximum(BEYOND, np.max([0.0 * found[0].excess, *held], axis=0))
@@ -279,7 +277,7 @@ def _calibrate_started(found: Sequence[LeftOut]) -> NDArray | None:
     return np.array([_calibrate(errors, i)[1] for i in range(errors[0][0].shape[2])])
 
 
-def errors_drift(errors: NDArray) -> bool:
+def errors_drift(errors: NDArray, *, drift: float = 0.01) -> bool:
     """Whether the mean error of an output has a linear trend over the time in a record.
 
     By Student's t test of the slope, with as many errors as are independent beside the trend.
@@ -288,6 +286,8 @@ def errors_drift(errors: NDArray) -> bool:
     ----------
     errors : ndarray, shape (r, T, d_y)
         Of samples that were left out of a fit, NaN elsewhere; a row is a record, or a part of one.
+    drift : float, default 0.01
+        Probability of a trend of errors over the time in a record that is no chance.
 
     """
     for own in np.moveaxis(errors, 2, 0):
@@ -302,7 +302,7 @@ def errors_drift(errors: NDArray) -> bool:
         free = seen.sum() / correlation_time(rest[..., None]) - 2
         if free > 0 and power > 0:
             deviation = np.sqrt(np.sum(rest**2) / (free * power))
-            if abs(slope) > stdtrit(free, 1 - DRIFT / 2 / errors.shape[2]) * deviation:
+            if abs(slope) > stdtrit(free, 1 - drift / 2 / errors.shape[2]) * deviation:
                 return True
     return False
 

@@ -16,8 +16,6 @@ import torch
 from numpy.polynomial import chebyshev
 from torch import Tensor
 
-ROUNDINGS = 4
-"""Deviation from a straight line that counts as rounding, in roundings of the larger end."""
 STRIDE = 4
 """Of this many samples of a piece one is compared with the chord."""
 MAX_POINTS = 24
@@ -162,9 +160,16 @@ def _interpolation(length: int, count: int, dtype: torch.dtype) -> tuple[Tensor,
     return of_samples, of_points, of_values
 
 
-def _rounding(one: Tensor, other: Tensor) -> Tensor:
-    """Largest effect of rounding on commands between these."""
-    return ROUNDINGS * torch.finfo(one.dtype).eps * torch.maximum(one.abs(), other.abs())
+def _rounding(one: Tensor, other: Tensor, *, roundings: int = 4) -> Tensor:
+    """Largest effect of rounding on commands between these.
+
+    Parameters
+    ----------
+    roundings : int, default 4
+        Deviation from a straight line that counts as rounding, in roundings of the larger end.
+
+    """
+    return roundings * torch.finfo(one.dtype).eps * torch.maximum(one.abs(), other.abs())
 
 
 def _samples(begin: Tensor, length: Tensor) -> Tensor:

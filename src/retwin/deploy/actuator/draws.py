@@ -18,10 +18,6 @@ from retwin.update.surrogate import Surrogate
 
 MAX_EARLY = 0.5
 """Share of draws at most whose delay is before the command; they get none."""
-NO_CHANGE = 1e-6
-"""Largest change of a command, relative to its range, that counts as none, as in `Segments`."""
-STILL = 1e-9
-"""Spread of targets, relative to their size, below which no gain can be estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +49,18 @@ class Draws:
     early: float
 
 
-def still_and_fastest(commands: NDArray) -> tuple[NDArray, NDArray]:
-    """The largest changes by one sample (d_u,) that count as none, and that are in `commands`."""
+def still_and_fastest(commands: NDArray, *, no_change: float = 1e-6) -> tuple[NDArray, NDArray]:
+    """The largest changes by one sample (d_u,) that count as none, and that are in `commands`.
+
+    Parameters
+    ----------
+    no_change : float, default 1e-6
+        Largest change of a command, relative to its range, that counts as none, as in `Segments`.
+
+    """
     low, high = commands.min(axis=(0, 1)), commands.max(axis=(0, 1))
     change: NDArray = np.abs(np.diff(commands, axis=1)).max(axis=(0, 1))
-    return NO_CHANGE * np.where(high > low, high - low, 1), change
+    return no_change * np.where(high > low, high - low, 1), change
 
 
 def causal_part(
@@ -190,10 +193,17 @@ def _targets(context: Context, operator: CommandSpace | DelayOffset) -> Tensor:
     return gather_samples(values, settle)
 
 
-def _slopes(target: Tensor, mean: Tensor) -> Tensor:
-    """Least-squares slopes (d,) of each column of `mean` (m, d) in that of `target` (m, d)."""
+def _slopes(target: Tensor, mean: Tensor, *, still: float = 1e-9) -> Tensor:
+    """Least-squares slopes (d,) of each column of `mean` (m, d) in that of `target` (m, d).
+
+    Parameters
+    ----------
+    still : float, default 1e-9
+        Spread of targets, relative to their size, below which no gain can be estimated.
+
+    """
     x, y = target.double(), mean.double()
     x, y = x - x.mean(dim=0), y - y.mean(dim=0)
     power = x.square().sum(dim=0)
-    least = STILL * target.double().square().sum(dim=0)
+    least = still * target.double().square().sum(dim=0)
     return torch.where(power > least, (x * y).sum(dim=0) / power.clamp_min(1e-300), 0.0).float()

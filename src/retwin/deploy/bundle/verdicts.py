@@ -33,10 +33,6 @@ LENGTH_LIMIT = 2.0
 """Limit of the ratio between a trajectory's length and that of the bundle's, or its inverse."""
 OUTSIDE = 10.0
 """Score, in multiples of a check's limit, above which a trajectory is outside."""
-SUM_TOLERANCE = 1e-3
-"""Greatest difference from 1 of the sum of probabilities, far above the rounding of float32."""
-MAX_LOG_ODDS = 50.0
-"""Bound of the log odds before `exp`, far beyond every limit and below any overflow."""
 
 Function = Callable[[Trajectories], NDArray]
 """Function of n trajectories to numbers (n,) or (n, k)."""
@@ -221,6 +217,7 @@ class Domain:
         energy: Function,
         *,
         steps: int | None = None,
+        max_log_odds: float = 50.0,
     ) -> Verdicts:
         """Score trajectories in all checks but the last.
 
@@ -236,6 +233,8 @@ class Domain:
             check before has found outside.
         steps : int, optional
             Samples of the trajectories that the bundle was made for; by default any number.
+        max_log_odds : float, default 50.0
+            Bound of the log odds before `exp`, far beyond every limit and below any overflow.
 
         Raises
         ------
@@ -261,7 +260,7 @@ class Domain:
         def residual(some: Trajectories) -> NDArray:
             # Energies are log odds, so this is the ratio of the odds to those at the limit.
             energies = energy(some)
-            odds = np.exp(np.clip(energies - self.energy, -MAX_LOG_ODDS, MAX_LOG_ODDS))
+            odds = np.exp(np.clip(energies - self.energy, -max_log_odds, max_log_odds))
             return np.where(np.isfinite(energies), odds, np.inf)
 
         # What overflows is not finite, and what is not finite is outside.
@@ -310,10 +309,17 @@ def _subset(trajectories: Trajectories, rows: NDArray) -> Trajectories:
     return trajectories if rows.all() else trajectories[rows]
 
 
-def are_probabilities(values: NDArray) -> NDArray:
-    """Flags (n,) of the rows (n, classes) that are between 0 and 1 and sum to 1; NaN is false."""
+def are_probabilities(values: NDArray, *, sum_tolerance: float = 1e-3) -> NDArray:
+    """Flags (n,) of the rows (n, classes) that are between 0 and 1 and sum to 1; NaN is false.
+
+    Parameters
+    ----------
+    sum_tolerance : float, default 1e-3
+        Greatest difference from 1 of the sum of probabilities, far above the rounding of float32.
+
+    """
     between = np.all((values >= 0) & (values <= 1), axis=1)
-    return between & (np.abs(values.sum(axis=1) - 1) <= SUM_TOLERANCE)
+    return between & (np.abs(values.sum(axis=1) - 1) <= sum_tolerance)
 
 
 def _excess(values: NDArray, low: Any, high: Any, mask: NDArray | None = None) -> NDArray:

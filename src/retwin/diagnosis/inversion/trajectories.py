@@ -47,8 +47,6 @@ TRAJECTORIES_PER_BATCH = 16
 """Trajectories inverted together, which bounds memory."""
 UNEXPLAINED = "no class explains the outputs nearly as well as in calibration"
 """The reason for which a trajectory is unknown although it was measured."""
-PAIRS = 0.01
-"""Probability, beforehand, of two stuck actuators over that of a single fault or none."""
 COVERAGE = 0.9
 """Coverage of all intervals."""
 
@@ -336,11 +334,17 @@ FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 
 
 def _several(
-    evidence: NDArray, classes: int, pairs: Sequence[tuple[str, str]]
+    evidence: NDArray, classes: int, pairs: Sequence[tuple[str, str]], *, prior_odds: float = 0.01
 ) -> tuple[NDArray, NDArray]:
     """The probability (n,) that a pair is true, and a sentence with the most probable pair.
 
-    `evidence` (n, C + pairs); beforehand all pairs are `PAIRS` as probable as all C classes.
+    `evidence` (n, C + pairs); beforehand all pairs are `prior_odds` as probable as all C classes.
+
+    Parameters
+    ----------
+    prior_odds : float, default 0.01
+        Probability, beforehand, of two stuck actuators over that of a single fault or none.
+
     """
     if not pairs:
         return np.zeros(len(evidence)), np.full(len(evidence), "", dtype=object)
@@ -348,7 +352,7 @@ def _several(
     two = logsumexp(evidence[:, classes:], axis=1) - np.log(len(pairs))
     best = evidence[:, classes:].argmax(axis=1)
     text = [f"more than one fault: {' and '.join(pairs[i])} explain the outputs best" for i in best]
-    return expit(two - one + np.log(PAIRS)), np.array(text, dtype=object)
+    return expit(two - one + np.log(prior_odds)), np.array(text, dtype=object)
 
 
 def _offsets(rows: Hypotheses, found: Inversion, classes: int, healthy: int) -> NDArray:

@@ -11,10 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import require, whole
 
-GLITCH = 100.0
-"""An error of so many standard deviations is scored, but the filter takes the sample as missing: a
-sample of 1e300 would else stay in its state. Where such samples persist, its uncertainty grows
-until it follows them."""
 LARGEST_PARTIAL = 0.9995
 """Of the partial autocorrelations: an average of two thousand samples."""
 GRID = [(a, b) for a in (-0.5, 0.2, 0.8, 1.4, 2.0, 2.6, 3.2) for b in (-8.0, -3.0, -1.0, 1.0, 3.0)]
@@ -195,18 +191,26 @@ Model = tuple[NDArray, NDArray | float, NDArray]
 
 
 def _errors(
-    values: NDArray, model: Model, mean: NDArray, covariance: NDArray
+    values: NDArray, model: Model, mean: NDArray, covariance: NDArray, *, glitch: float = 100.0
 ) -> Iterator[tuple[NDArray, NDArray]]:
     """Errors and their variances (..., streams), sample by sample; mean and covariance change.
 
     Shapes: values (T, streams), covariance (p, p, ..., streams).
+
+    Parameters
+    ----------
+    glitch : float, default 100.0
+        An error of so many standard deviations is scored, but the filter takes the sample as
+        missing: a sample of 1e300 would else stay in its state. Where such samples persist, its
+        uncertainty grows until it follows them.
+
     """
     coefficients, process, measurement = model
     order = len(coefficients)
     for value in values:
         error = value - mean[0]
         variance = covariance[0, 0] + measurement
-        used = np.abs(error) <= GLITCH * np.sqrt(variance)  # False for NaN
+        used = np.abs(error) <= glitch * np.sqrt(variance)  # False for NaN
         yield error, variance
         gain = np.where(used, covariance[0] / variance, 0.0)
         first = covariance[0].copy()

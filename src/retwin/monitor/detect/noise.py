@@ -20,12 +20,8 @@ DECAYS = np.array([0.5, 0.9, 0.98])
 samples. A sum of them describes what lasts for any time between."""
 NARROWEST = 1e-3
 """Width of the interval of an error that is not rounded, in its standard deviations."""
-PENALTY = 4.0
-"""Of squared weights, in nats: a weight is 0 but for a few samples' evidence of another one."""
 LARGEST = 4.0
 """Errors count up to this for the scale of a record, so that no fault is taken for it."""
-FEWEST = 8
-"""Errors of a record of which the variance is counted."""
 DEGREES = (4.0, 1e4)
 """Limits of the degrees of freedom of a record's variance."""
 FARTHEST = 8.0
@@ -91,12 +87,19 @@ def own_scale(sums: NDArray, errors: NDArray, degrees: NDArray) -> tuple[NDArray
     return np.sqrt(total / count), sums[:, :, -1]
 
 
-def fit_degrees(errors: NDArray, folds: Sequence[NDArray]) -> NDArray:
-    """Degrees of freedom (S,) of the variance of records, from errors (S, T) that were left out."""
+def fit_degrees(errors: NDArray, folds: Sequence[NDArray], *, fewest: int = 8) -> NDArray:
+    """Degrees of freedom (S,) of the variance of records, from errors (S, T) that were left out.
+
+    Parameters
+    ----------
+    fewest : int, default 8
+        Errors of a record of which the variance is counted.
+
+    """
     squares = np.minimum(np.abs(np.nan_to_num(errors)), LARGEST) ** 2
     pairs = ((squares[:, fold], np.isfinite(errors[:, fold])) for fold in folds)
     sums = np.array([(both[0].sum(axis=1), both[1].sum(axis=1)) for both in pairs])
-    enough = sums[:, 1] >= FEWEST
+    enough = sums[:, 1] >= fewest
     logs = np.where(enough, np.log(np.maximum(sums[:, 0], 1e-9) / np.maximum(sums[:, 1], 1)), 0.0)
     spread = (logs**2).sum(axis=0) / np.maximum(enough.sum(axis=0) - 1, 1)
     made: NDArray = np.clip(2 / np.maximum(spread, 1e-9), *DEGREES)
@@ -187,8 +190,15 @@ def _density(mean: NDArray, logs: NDArray, error: NDArray, width: NDArray) -> ND
     return made - np.log(width)
 
 
-def _fitted(design: NDArray, error: NDArray, width: NDArray) -> NDArray:
-    """Weights (2, F) of mean and logarithm of the scale that maximise the penalised likelihood."""
+def _fitted(design: NDArray, error: NDArray, width: NDArray, *, penalty: float = 4.0) -> NDArray:
+    """Weights (2, F) of mean and logarithm of the scale that maximise the penalised likelihood.
+
+    Parameters
+    ----------
+    penalty : float, default 4.0
+        Of squared weights, in nats: a weight is 0 but for a few samples' evidence of another one.
+
+    """
     size = design.shape[1]
 
     def loss(point: NDArray) -> tuple[float, NDArray]:
@@ -202,7 +212,7 @@ def _fitted(design: NDArray, error: NDArray, width: NDArray) -> NDArray:
         slopes = np.stack([low * (1 - low), high * (1 - high)])
         by_mean = (slopes[1] - slopes[0]) / mass / scale * np.where(upper, -1, 1)
         by_scale = (slopes[1] * ends[1] - slopes[0] * ends[0]) / mass
-        ridge = PENALTY * np.where(np.arange(2 * size) % size == size - 1, 0.0, 1.0)
+        ridge = penalty * np.where(np.arange(2 * size) % size == size - 1, 0.0, 1.0)
         value = -np.log(mass).sum() + (ridge * point**2).sum() / 2
         slope = np.concatenate([by_mean @ design, by_scale @ design])
         return float(value), slope + ridge * point

@@ -35,8 +35,6 @@ SMALLEST = 0.1
 DEGREES = (2.5, 100.0)
 """Degrees of freedom of Student's distribution that are tried: below 2 it has no variance, and
 above 100 it is a normal one."""
-TRIED = 60
-"""Degrees of freedom that are tried between these."""
 WORSE = CERTAIN**2 / 2
 """Nats by which degrees of freedom may be less likely than the best: 95 % in each direction."""
 
@@ -162,9 +160,16 @@ def _moments(sums: NDArray) -> tuple[NDArray, NDArray]:
     return mean, np.sqrt(np.maximum(sums[2] / count - mean**2, 0.0))
 
 
-def _degrees(errors: NDArray) -> NDArray:
-    """The fewest, the most likely and the most degrees of freedom (3,) of standardised errors."""
-    tried = np.geomspace(*DEGREES, TRIED)
+def _degrees(errors: NDArray, *, degrees_tried: int = 60) -> NDArray:
+    """The fewest, the most likely and the most degrees of freedom (3,) of standardised errors.
+
+    Parameters
+    ----------
+    degrees_tried : int, default 60
+        Degrees of freedom that are tried between these.
+
+    """
+    tried = np.geomspace(*DEGREES, degrees_tried)
     if not len(errors):
         return tried[[0, -1, -1]]
     likelihood = np.array([_log_density(errors, each).sum() for each in tried])

@@ -36,8 +36,6 @@ SETTLED = 1.05
 which the filter knows the states of a machine that it did not see start."""
 WIDER = 1.25 ** np.arange(1, 17)
 """Factors of the slack of which the first is taken with which the calibration agrees."""
-WINDOWS = 16
-"""Windows of successive samples that the calibration contains at least, for their mean product."""
 
 
 @dataclass(frozen=True)
@@ -163,10 +161,17 @@ def agreeing(
     return tuple(made)
 
 
-def _bets_win(detector: Detector, parts: Sequence[Scored]) -> NDArray:
+def _bets_win(detector: Detector, parts: Sequence[Scored], *, windows: int = 16) -> NDArray:
     """Streams with an alternative whose bets over successive samples have a mean product above 1.
 
-    All lengths that the parts contain `WINDOWS` times are tried, in powers of two.
+    All lengths that the parts contain `windows` times are tried, in powers of two.
+
+    Parameters
+    ----------
+    windows : int, default 16
+        Windows of successive samples that the calibration contains at least, for their mean
+        product.
+
     """
     first = np.zeros(len(detector.which))
     logs = []
@@ -174,7 +179,7 @@ def _bets_win(detector: Detector, parts: Sequence[Scored]) -> NDArray:
         factors = detector.factors(first, *detector.intervals(first, low, high))
         logs.append(np.cumsum(np.log([factor for factor, _, _ in factors]), axis=0))
     made = np.zeros(len(first), dtype=bool)
-    length, longest = 1, sum(len(each) for each in logs) // WINDOWS
+    length, longest = 1, sum(len(each) for each in logs) // windows
     while length <= longest:
         products = [np.exp(each[length:] - each[:-length]) for each in logs]
         made |= (np.concatenate(products).mean(axis=0) > 1 + 1e-9).any(axis=0)

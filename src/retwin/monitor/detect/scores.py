@@ -18,12 +18,8 @@ MIN_ERRORS = 8
 """Calibration errors per stream, at least."""
 COPIES = 8
 """Places inside a rounding interval that stand for a rounded error."""
-REPEATED = 0.02
-"""Share of samples that repeat the one before from which on a sensor may round."""
 NEAR = 10.0
 """Steps up to which a difference is counted with a step that is not exact yet."""
-INEXACT = 0.05
-"""Share of a step by which a value may be no multiple of it."""
 SCALES = np.geomspace(0.05, 2, 32)
 """Standard deviations of errors before rounding, relative to those after it."""
 
@@ -189,12 +185,21 @@ def resolution(measured: ArrayLike) -> NDArray:
     return np.array([_step_of(row[np.isfinite(row)]) for row in given])
 
 
-def _step_of(seen: NDArray) -> float:
-    """The step of finite values (n,), 0 for none."""
+def _step_of(seen: NDArray, *, inexact: float = 0.05, repeated_share: float = 0.02) -> float:
+    """The step of finite values (n,), 0 for none.
+
+    Parameters
+    ----------
+    inexact : float, default 0.05
+        Share of a step by which a value may be no multiple of it.
+    repeated_share : float, default 0.02
+        Share of samples that repeat the one before from which on a sensor may round.
+
+    """
     values = np.unique(seen)
     if len(values) >= len(seen) / 2:
         repeated = seen[1:][np.diff(seen) == 0]
-        values = np.unique(repeated) if len(repeated) > REPEATED * len(seen) else values[:0]
+        values = np.unique(repeated) if len(repeated) > repeated_share * len(seen) else values[:0]
     if len(values) < 2:
         return 0.0
     offsets, gaps = values - values[0], np.diff(values)
@@ -205,7 +210,7 @@ def _step_of(seen: NDArray) -> float:
         better = float(many @ gaps[near] / (many @ many))
         number = np.concatenate([[0], np.cumsum(np.round(gaps / better))])
         exact = float(number @ offsets / (number @ number))
-        if np.all(np.abs(offsets - exact * number) <= INEXACT * exact):
+        if np.all(np.abs(offsets - exact * number) <= inexact * exact):
             return exact
     return 0.0
 

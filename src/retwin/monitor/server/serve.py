@@ -20,8 +20,6 @@ else:
     uvicorn = needs_extra("uvicorn", "monitor", "serves the monitor's page")
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
-PATIENCE = 3
-"""Seconds for which requests are finished at the end."""
 HEADERS = 10.0
 """Seconds within which the headers of a request have to end, or its connection is closed: each one
 counts towards those that are served at the same time, and no token was asked for yet."""
@@ -82,10 +80,16 @@ def listening(host: str, port: int) -> socket.socket:
 
 
 @contextmanager
-def serving(app: RequestGuard, bound: socket.socket) -> Iterator[None]:
+def serving(app: RequestGuard, bound: socket.socket, *, patience: int = 3) -> Iterator[None]:
     """Serve an application of `create_app` in a thread while the block runs.
 
     The socket is one of `listening`.
+
+    Parameters
+    ----------
+    patience : int, default 3
+        Seconds for which requests are finished at the end.
+
     """
     config = uvicorn.Config(
         app,
@@ -95,7 +99,7 @@ def serving(app: RequestGuard, bound: socket.socket) -> Iterator[None]:
         access_log=False,
         server_header=False,
         limit_concurrency=500,
-        timeout_graceful_shutdown=PATIENCE,
+        timeout_graceful_shutdown=patience,
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, args=([bound],), name="server")

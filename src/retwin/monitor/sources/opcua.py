@@ -95,8 +95,6 @@ TIMEOUT = 4.0
 """Seconds in which the server must answer."""
 LONGEST = 1.0
 """Seconds between two publications, at most."""
-QUEUE = 1000
-"""Values of a node that the server keeps while the connection is lost."""
 FILES = "give the files that the server's administrator made"
 """What to do where one cannot be used."""
 MARGIN = 1.5
@@ -247,8 +245,15 @@ class OpcUa(Source):
         with refusing(f"sources.nodes: {text!r}", expected=expected, remedy=remedy):
             return self._asyncua.ua.NodeId.from_string(text)
 
-    def _items(self, subscription: Any) -> list[Any]:
-        """What the server is asked for: each new value or time of each node."""
+    def _items(self, subscription: Any, *, queue: int = 1000) -> list[Any]:
+        """What the server is asked for: each new value or time of each node.
+
+        Parameters
+        ----------
+        queue : int, default 1000
+            Values of a node that the server keeps while the connection is lost.
+
+        """
         ua = self._asyncua.ua
         items = []
         for handle, node in enumerate(self._used, 1):
@@ -259,7 +264,7 @@ class OpcUa(Source):
                 ClientHandle=handle,
                 SamplingInterval=1000 * self._interval,
                 Filter=ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp),
-                QueueSize=QUEUE,
+                QueueSize=queue,
                 DiscardOldest=True,
             )
             items.append(asked)

@@ -26,8 +26,6 @@ WRITER = 0x72657477696E
 """The number of the lock that the one process that writes holds in PostgreSQL: "retwin"."""
 PATIENCE = 5.0
 """Seconds for which a lock inside SQLite is waited for."""
-RELEASE = 2.0
-"""Seconds in which PostgreSQL notices that a process ended, and frees its lock."""
 PRAGMAS = {
     "journal_mode": "wal",
     "synchronous": 2,  # FULL: each commit is flushed to the disk
@@ -40,8 +38,6 @@ PRAGMAS = {
 SERVER = {"fsync": "on", "full_page_writes": "on", "synchronous_commit": "on"}
 """Settings of PostgreSQL without which a commit is not durable."""
 
-AT_ONCE = 500
-"""Times that are looked for at once; a query has a limit."""
 TABLES = sa.MetaData()
 meta = sa.Table(
     "retwin_meta",
@@ -205,15 +201,21 @@ class Database:
         remedy = "open it with the version of retwin that wrote it, or a newer one"
         require(found == str(SCHEMA), self.name, expected=expected, got=got, remedy=remedy)
 
-    def _hold(self) -> None:
+    def _hold(self, *, release: float = 2.0) -> None:
         """Take the lock of the process that writes, which ends with the connection.
 
         In SQLite the lock on the store's folder does that.
+
+        Parameters
+        ----------
+        release : float, default 2.0
+            Seconds in which PostgreSQL notices that a process ended, and frees its lock.
+
         """
         if self._sqlite:
             return
         ask = sa.text(f"SELECT pg_try_advisory_lock({WRITER})")
-        until = time.monotonic() + RELEASE
+        until = time.monotonic() + release
         while not (held := self._writer.execute(ask).scalar_one()) and time.monotonic() < until:
             time.sleep(0.1)
         self._writer.commit()
@@ -257,11 +259,18 @@ class Database:
         nothing(self.name, wrong, expected, remedy=remedy)
 
 
-def present(connection: Any, key: int, times: NDArray) -> NDArray:
-    """Those of the times that samples of an asset have; others between them are not read."""
+def present(connection: Any, key: int, times: NDArray, *, at_once: int = 500) -> NDArray:
+    """Those of the times that samples of an asset have; others between them are not read.
+
+    Parameters
+    ----------
+    at_once : int, default 500
+        Times that are looked for at once; a query has a limit.
+
+    """
     found: list[int] = []
-    for first in range(0, len(times), AT_ONCE):
-        chosen = samples.c.time.in_(times[first : first + AT_ONCE].tolist())
+    for first in range(0, len(times), at_once):
+        chosen = samples.c.time.in_(times[first : first + at_once].tolist())
         own = sa.select(samples.c.time).where(samples.c.asset == key, chosen)
         found += connection.execute(own).scalars().all()
     return np.array(found, dtype=np.int64)

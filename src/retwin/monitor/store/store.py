@@ -45,8 +45,6 @@ FILE = "monitor.sqlite"
 """The database in the folder of the store, where no other is given."""
 ROWS = 4096
 """Rows that are read at once."""
-SURPLUS = 0.1
-"""Share of `max_samples` by which an asset may exceed it, so that samples are removed in groups."""
 
 
 class Store:
@@ -352,10 +350,18 @@ class Store:
             self._held[key] = _Held(count, EARLIEST if latest is None else latest)
         return self._held[key]
 
-    def _remove_surplus(self, connection: Any, key: int) -> None:
-        """Remove the oldest samples of an asset that has too many."""
+    def _remove_surplus(self, connection: Any, key: int, *, surplus: float = 0.1) -> None:
+        """Remove the oldest samples of an asset that has too many.
+
+        Parameters
+        ----------
+        surplus : float, default 0.1
+            Share of `max_samples` by which an asset may exceed it, so that samples are removed in
+            groups.
+
+        """
         held = self._held_by(connection, key)
-        if self._max_samples is None or held.count <= self._max_samples * (1 + SURPLUS):
+        if self._max_samples is None or held.count <= self._max_samples * (1 + surplus):
             return
         own = samples.c.asset == key
         times = sa.select(samples.c.time).where(own).order_by(samples.c.time)

@@ -37,10 +37,6 @@ MAX_SAMPLES = 20_000
 MIN_TRAJECTORIES, MAX_TRAJECTORIES = 2 * BLOCKS, 6 * BLOCKS
 """Healthy trajectories of all assets together that are compared: at least, so that a block of the
 bootstrap has two, and at most, since diagnosing each may take seconds."""
-TRAJECTORIES_BEFORE = 10
-"""Trajectories before an alarm that are left out: its cause may already act in them."""
-DRAWS = 200
-"""Simulations of each trajectory; the CRPS has no bias by their number."""
 FRESH, PATIENCE, QUEUE = 60.0, 20.0, 16
 """A comparison is kept for so many seconds, or for so many times as long as it took, whichever is
 longer; and comparisons that may be made or kept."""
@@ -194,18 +190,24 @@ def _tested(monitor: TrajectoryMonitor, machines: list[list[Trajectories]]) -> F
 
 
 def _healthy_trajectories(
-    store: Store, twin: str, monitor: TrajectoryMonitor
+    store: Store, twin: str, monitor: TrajectoryMonitor, *, trajectories_before: int = 10
 ) -> Iterator[list[NDArray]]:
     """The longest healthy part of each asset: trajectories (T, d_u + d_y) that follow each other.
 
     Those with nothing measured are left out.
+
+    Parameters
+    ----------
+    trajectories_before : int, default 10
+        Trajectories before an alarm that are left out: its cause may already act in them.
+
     """
     alarms, machines = collect_times(store, "begin", "alarm"), list(_machines(store, twin))
     for asset, _, state in machines:
         known = state.get("trajectories", np.zeros((0, 3), dtype=np.int64))
         ends = np.flatnonzero(np.isin(known[:, 0], alarms.get(asset, [])))
         begins = np.concatenate([[0], ends + 1])
-        lasts = np.maximum(np.concatenate([ends - TRAJECTORIES_BEFORE, [len(known)]]), begins)
+        lasts = np.maximum(np.concatenate([ends - trajectories_before, [len(known)]]), begins)
         longest = int(np.argmax(lasts - begins))
         part = known[begins[longest] : lasts[longest]][-max(1, MAX_TRAJECTORIES // len(machines)) :]
         made = []
@@ -230,11 +232,18 @@ def _deviation(measured: NDArray) -> NDArray:
     return np.where(found > 0, found, 1.0)
 
 
-def _crps(twin: Twin, record: Trajectories, unit: NDArray) -> float:
-    """The mean CRPS of a trajectory over its measured samples and outputs."""
+def _crps(twin: Twin, record: Trajectories, unit: NDArray, *, draws: int = 200) -> float:
+    """The mean CRPS of a trajectory over its measured samples and outputs.
+
+    Parameters
+    ----------
+    draws : int, default 200
+        Simulations of each trajectory; the CRPS has no bias by their number.
+
+    """
     with warnings.catch_warnings():  # both versions see the same commands
         warnings.simplefilter("ignore")
-        found = simulate_records(twin, record, draws=DRAWS, seed=0).crps[0] / unit
+        found = simulate_records(twin, record, draws=draws, seed=0).crps[0] / unit
     return float(found[record.mask[0]].mean())
 
 

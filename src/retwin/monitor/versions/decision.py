@@ -14,8 +14,6 @@ from retwin.scores.bootstrap import BLOCKS, MIN_RECORDS, bootstrap_means
 
 MIN_SAMPLES = 10 * BLOCKS
 """Samples of a record at least, so that a block of the bootstrap has ten."""
-DRAWS = 4000
-"""Bootstrap draws of the mean difference, whose standard deviation they give to about 1 %."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +86,7 @@ def decide(
     *,
     reference: FalseAlarmTest | None = None,
     seed: int = 0,
+    resamplings: int = 4000,
 ) -> Decision:
     """Compare two versions on the same samples.
 
@@ -102,6 +101,8 @@ def decide(
         Those of the first active version, see `Decision`.
     seed : int
         Seed of the bootstrap.
+    resamplings : int, default 4000
+        Bootstrap draws of the mean difference, whose standard deviation they give to about 1 %.
 
     Raises
     ------
@@ -136,7 +137,7 @@ def decide(
     expected = f"at least {least} samples of each record"
     require(fewest >= least, "crps", expected=expected, got=fewest, remedy="collect more samples")
     difference = (old - new)[:, :, None]
-    draws = bootstrap_means(difference, draws=DRAWS, seed=seed)
+    draws = bootstrap_means(difference, draws=resamplings, seed=seed)
     mean = float(np.nanmean(difference, axis=1).mean())
     scale = 1.96  # of many records: the draws are already as wide as Student's interval
     if len(old) < MIN_RECORDS:

@@ -22,8 +22,6 @@ SENTENCES = 4
 """Outputs that have a sentence of their own, at most."""
 SMALL = 0.02
 """Ratio of errors below which a change in percent has decimals."""
-SMALL_SHARE = 0.01
-"""Share of a range below which it is given with more digits."""
 ELSEWHERE = 2.0
 """Ratio of the errors at the begin of trajectories and later, from which it is named."""
 STRONG = 0.95
@@ -73,9 +71,16 @@ def state(each: ParameterEstimate) -> str:
     return f"not identified: interval covers {_share(each.covered)} of the range{leaves}"
 
 
-def _share(share: float) -> str:
-    """`38 %`; below one percent with a digit."""
-    return f"{100 * share:.2g} %" if share < SMALL_SHARE else f"{100 * share:.0f} %"
+def _share(share: float, *, small_share: float = 0.01) -> str:
+    """`38 %`; below one percent with a digit.
+
+    Parameters
+    ----------
+    small_share : float, default 0.01
+        Share of a range below which it is given with more digits.
+
+    """
+    return f"{100 * share:.2g} %" if share < small_share else f"{100 * share:.0f} %"
 
 
 def combination(direction: Direction) -> str:

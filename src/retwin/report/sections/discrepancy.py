@@ -12,8 +12,6 @@ from retwin.report.sections.segment import segment, segment_figure
 from retwin.report.study import Component, Study
 from retwin.results import FidelityFigure
 
-FEW = 3
-"""The number of sources up to which all are shown in detail."""
 KINDS = {"tde": "delay", "tpe": "offset_", "noise": "noise_"}
 """The figures by name, and the first letters of the components of z that they show."""
 
@@ -43,10 +41,17 @@ def suffixes(study: Study) -> dict[str, str]:
     return {source: f"-{place + 1}" if place else "" for place, source in enumerate(known)}
 
 
-def detailed(study: Study) -> list[str]:
-    """Sources that are shown in detail; of many, the updated ones."""
+def detailed(study: Study, *, few: int = 3) -> list[str]:
+    """Sources that are shown in detail; of many, the updated ones.
+
+    Parameters
+    ----------
+    few : int, default 3
+        The number of sources up to which all are shown in detail.
+
+    """
     known = labels.order(study.results.fidelity)
-    return known if len(known) <= FEW else labels.with_role(known, "updated") or known[-FEW:]
+    return known if len(known) <= few else labels.with_role(known, "updated") or known[-few:]
 
 
 def titled(study: Study, source: str, title: str) -> str:

@@ -39,8 +39,6 @@ from retwin.update.blackbox.lags import Lags, least_squares
 from retwin.update.dynamics.estimation import Point
 from retwin.update.dynamics.unknowns import coefficients_of
 
-MAX_ORDER = 8
-"""Largest number of past samples that is tried."""
 START = 10.0
 """Bound of the states at the first sample, over their largest value at rest."""
 
@@ -52,11 +50,18 @@ def fit_arx(observed: Trajectories, seed: int, progress: Progress | None) -> Bla
 
 
 def best_linear(
-    observed: Trajectories, progress: Progress | None = None
+    observed: Trajectories, progress: Progress | None = None, *, max_order: int = 8
 ) -> tuple[Linear, BlackBoxFit]:
-    """The linear model of the best order, and its fit."""
+    """The linear model of the best order, and its fit.
+
+    Parameters
+    ----------
+    max_order : int, default 8
+        Largest number of past samples that is tried.
+
+    """
     check_records(observed)
-    orders = range(1, MAX_ORDER + 1)
+    orders = range(1, max_order + 1)
     order, fit = best_order(orders, lambda n: Linear(Lags(observed, n, 1)).fit(), progress)
     return Linear(Lags(observed, order, 1)), fit
 

@@ -27,8 +27,6 @@ from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 from retwin.update.forecast_errors import value_range
 
-FOLDS = 10
-"""Parts of the calibration record, each made of blocks of all trajectories, that are held out."""
 MAX_REFITTED_SAMPLES = 100_000
 """Samples that are fitted again and again, without each part in turn; of longer records fewer
 parts are held out."""
@@ -43,10 +41,6 @@ STEP = 10.0
 """Ratio of that variance to the next one."""
 MAX_STRENGTHS = 8
 """Number of variances at most."""
-SEARCH = 25
-"""Steps of the search with each variance at most."""
-MAX_PASSES = 6
-"""Times that the error of the outputs is estimated anew."""
 SAME = 0.1
 """Logarithm of the ratio of two variances below which they agree."""
 
@@ -105,10 +99,17 @@ class BlackBoxFit:
     def _tested(self) -> Estimation:
         return replace(self.estimation, seen=~np.isnan(self.errors))
 
-    def searched(self, variance: NDArray) -> BlackBoxFit:
-        """The most probable point nearby with another variance of the errors."""
+    def searched(self, variance: NDArray, *, max_steps: int = 25) -> BlackBoxFit:
+        """The most probable point nearby with another variance of the errors.
+
+        Parameters
+        ----------
+        max_steps : int, default 25
+            Steps of the search with each variance at most.
+
+        """
         estimation = replace(self.estimation, variance=variance)
-        found = estimation.minimised(estimation.linearised(self.point), SEARCH)
+        found = estimation.minimised(estimation.linearised(self.point), max_steps)
         return replace(self, estimation=estimation, point=found.point)
 
     def model(self, order: int, corrected: int) -> BlackBox:
@@ -183,16 +184,22 @@ def best_order(
     return given("observed", best, expected, got=got, remedy=remedy)
 
 
-def held_out_parts(seen: NDArray) -> list[NDArray]:
+def held_out_parts(seen: NDArray, *, folds: int = 10) -> list[NDArray]:
     """The parts (n, T) of a record that are held out in turn.
 
     Each trajectory is cut into blocks, of which a part has one, another one in each. The first
     block is in no part, since without it hardly anything determines the states at the start.
+
+    Parameters
+    ----------
+    folds : int, default 10
+        Parts of the calibration record, each made of blocks of all trajectories, that are held out.
+
     """
     trajectories, samples, _ = seen.shape
-    block = np.arange(samples) * (FOLDS + 1) // samples
-    own = (block - 1 + np.arange(trajectories)[:, None]) % FOLDS
-    count = int(np.clip(MAX_REFITTED_SAMPLES // max(1, seen.sum()), 1, FOLDS))
+    block = np.arange(samples) * (folds + 1) // samples
+    own = (block - 1 + np.arange(trajectories)[:, None]) % folds
+    count = int(np.clip(MAX_REFITTED_SAMPLES // max(1, seen.sum()), 1, folds))
     return [(own == part) & (block > 0) for part in range(count)]
 
 
@@ -287,11 +294,18 @@ def observed_variance(estimation: Estimation, point: Point) -> NDArray:
     return estimation.power(residual) * correlation_time(residual)
 
 
-def followed(estimation: Estimation, point: Point) -> BlackBoxFit | None:
-    """The fit whose assumed errors are those that are observed; None where the start diverges."""
+def followed(estimation: Estimation, point: Point, *, max_passes: int = 6) -> BlackBoxFit | None:
+    """The fit whose assumed errors are those that are observed; None where the start diverges.
+
+    Parameters
+    ----------
+    max_passes : int, default 6
+        Times that the error of the outputs is estimated anew.
+
+    """
     if not np.isfinite(estimation.residual(point)).all():
         return None
-    for _ in range(MAX_PASSES):
+    for _ in range(max_passes):
         variance = observed_variance(estimation, point)
         settled = np.all(np.abs(np.log(variance / estimation.variance)) < SAME)
         estimation = replace(estimation, variance=variance)

@@ -44,13 +44,9 @@ WIDER = 4.0
 that diverges is held there, and the model warns that it leaves the range."""
 MARGIN = 1.0
 """How far samples before the first one may lie beyond the range of a channel, in widths of it."""
-MAX_TERMS = 40
-"""Largest number of terms of an output that is tried."""
 SIGNIFICANT = 12.0
 """What a term explains at least, over the variance of the error that is left: the largest of some
 hundred terms explains as much of white noise with a probability of 5 %."""
-MAX_ROWS = 20_000
-"""Number of samples at which terms are ordered."""
 DISTINCT = 1e-5
 """Norm of what a term of norm 1 has beyond the chosen ones, below which it is a combination."""
 
@@ -162,11 +158,20 @@ class Polynomial:
         )
         return replace(estimation, unknowns=unknowns)
 
-    def chosen(self) -> list[list[int]]:
-        """The terms of each output, in the order of forward regression after the linear ones."""
+    def chosen(self, *, max_terms: int = 40, max_rows: int = 20_000) -> list[list[int]]:
+        """The terms of each output, in the order of forward regression after the linear ones.
+
+        Parameters
+        ----------
+        max_terms : int, default 40
+            Largest number of terms of an output that is tried.
+        max_rows : int, default 20_000
+            Number of samples at which terms are ordered.
+
+        """
         rows = self.lags.rows
-        some = np.linspace(0, len(rows) - 1, min(len(rows), MAX_ROWS)).astype(int)
-        most = min(MAX_TERMS, len(rows) // ROWS_PER_TERM)
+        some = np.linspace(0, len(rows) - 1, min(len(rows), max_rows)).astype(int)
+        most = min(max_terms, len(rows) // ROWS_PER_TERM)
         return [forward(rows.values[some], y, most, self.linear) for y in rows.outputs[some].T]
 
 

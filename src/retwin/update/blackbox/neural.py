@@ -36,8 +36,6 @@ from retwin.update.blackbox.lags import Lags
 from retwin.update.dynamics.estimation import Point
 from retwin.update.state_surrogate.equations import ChannelScale, Equations
 
-SAMPLES_PER_WEIGHT = 10
-"""Measured samples per number of the network at least."""
 WIDTHS = (2, 16)
 """Least and largest width of the hidden layer."""
 START = 3.0
@@ -77,7 +75,7 @@ def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) 
 
 
 def begin_with(
-    linear: Linear, fit: BlackBoxFit, rng: np.random.Generator
+    linear: Linear, fit: BlackBoxFit, rng: np.random.Generator, *, samples_per_weight: int = 10
 ) -> tuple[Equations, NDArray]:
     """A linear model in coordinates in which its states are white, beside a random network.
 
@@ -89,6 +87,8 @@ def begin_with(
         Its coefficients, which `Linear.without` found.
     rng : Generator
         Of the weights of the network, which have no effect yet.
+    samples_per_weight : int, default 10
+        Measured samples per number of the network at least.
 
     Returns
     -------
@@ -114,7 +114,7 @@ def begin_with(
     white = (states - middle) @ whiten.T
     speed = np.sqrt(np.mean(np.diff(white, axis=1) ** 2, axis=(0, 1)))
     samples = int(fit.estimation.seen.sum())
-    hidden = samples // (SAMPLES_PER_WEIGHT * (2 * size + inputs + 1))
+    hidden = samples // (samples_per_weight * (2 * size + inputs + 1))
     hidden = int(np.clip(hidden, *WIDTHS))
     arrays = {
         "A": whiten @ a @ back,

@@ -14,11 +14,6 @@ from retwin.inference.problem import Rows
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.warp import within
 
-GRID = 64
-"""Intervals of a grid of delays at most, where those are not below one sample."""
-AT_BOUND = 1e-3
-"""Distance from a bound, in widths of the range, within which a delay is at that bound."""
-
 
 @dataclass(frozen=True, eq=False)
 class DelayProblem(Rows, ABC):
@@ -91,9 +86,16 @@ def common_delay(problem: DelayProblem, x: Tensor, delay_range: tuple[float, flo
         grid = _grid(best - step, best + step)
 
 
-def _grid(low: float, high: float) -> Tensor:
-    """Delays in whole samples between limits, the smallest first."""
-    step = max(1, round((high - low) / GRID))
+def _grid(low: float, high: float, *, intervals: int = 64) -> Tensor:
+    """Delays in whole samples between limits, the smallest first.
+
+    Parameters
+    ----------
+    intervals : int, default 64
+        Intervals of a grid of delays at most, where those are not below one sample.
+
+    """
+    step = max(1, round((high - low) / intervals))
     grid = torch.arange(low, high + 1.0, step, dtype=torch.float64)
     return grid[grid.abs().argsort(stable=True)]
 
@@ -117,8 +119,15 @@ def delay_bounds(
     return Bounds(low.flatten(), high.flatten(), step.flatten())
 
 
-def at_bound(delay: Tensor, delay_range: tuple[float, float]) -> Tensor:
-    """Whether delays are at a bound of their range, where the best one may lie beyond."""
+def at_bound(delay: Tensor, delay_range: tuple[float, float], *, at_bound: float = 1e-3) -> Tensor:
+    """Whether delays are at a bound of their range, where the best one may lie beyond.
+
+    Parameters
+    ----------
+    at_bound : float, default 1e-3
+        Distance from a bound, in widths of the range, within which a delay is at that bound.
+
+    """
     low, high = delay_range
-    near = AT_BOUND * (high - low)
+    near = at_bound * (high - low)
     return (delay <= low + near) | (delay >= high - near)

@@ -23,14 +23,8 @@ from retwin.update.kernels.generation import joined_samples
 LONGEST_PERIOD = 1000
 """Longest sampling period that is searched for, in time steps of the record: it bounds the time
 that the search takes. Other limits are shares of the record."""
-MIN_VALUES = 20
-"""Fewest sampled values of a record from which their period is estimated."""
-PLAIN = 0.2
-"""Largest bend at the next most bent phase, relative to that at the sampling phase."""
 ROUNDING = 1e-6
 """Difference from a whole number of time steps that is only the rounding of numbers."""
-SMOOTH = 1e-6
-"""Largest bend, in standard deviations of an output, that is only the rounding of numbers."""
 REGULAR, GROSS = 0.9, 30.0
 """A value is a glitch if its error is `GROSS` times this quantile of all errors."""
 LEVELS = np.linspace(0, 1, 33)
@@ -229,11 +223,18 @@ class SampledSensor:
         return hit * size.new_tensor(self.glitch_size or 0.0) * size
 
 
-def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:
-    """Sampling period and phases: the longest period with plain kinks."""
+def _timing(observed: Tensor, mask: Tensor, *, min_values: int = 20) -> tuple[int, tuple[int, ...]]:
+    """Sampling period and phases: the longest period with plain kinks.
+
+    Parameters
+    ----------
+    min_values : int, default 20
+        Fewest sampled values of a record from which their period is estimated.
+
+    """
     measured = int(mask.any(dim=-1).any(dim=0).sum())
     bends = _bends(observed, mask)
-    for every in range(min(LONGEST_PERIOD, measured // MIN_VALUES), 1, -1):
+    for every in range(min(LONGEST_PERIOD, measured // min_values), 1, -1):
         kinks = _kinks(bends, every)
         plain = _plain(kinks)
         if 2 * plain.sum() > (kinks.amax(dim=1) > 0).sum():
@@ -263,10 +264,19 @@ def _kinks(bends: Tensor, every: int) -> Tensor:
     return whole.unflatten(1, (-1, every)).nanmean(dim=1).nan_to_num(0.0)
 
 
-def _plain(kinks: Tensor) -> Tensor:
-    """Whether a record (n,) bends at one phase and hardly at others."""
+def _plain(kinks: Tensor, *, plain: float = 0.2, smooth: float = 1e-6) -> Tensor:
+    """Whether a record (n,) bends at one phase and hardly at others.
+
+    Parameters
+    ----------
+    plain : float, default 0.2
+        Largest bend at the next most bent phase, relative to that at the sampling phase.
+    smooth : float, default 1e-6
+        Largest bend, in standard deviations of an output, that is only the rounding of numbers.
+
+    """
     largest, second = kinks.topk(2, dim=1).values.unbind(dim=1)
-    return (largest > SMOOTH) & (second < PLAIN * largest)
+    return (largest > smooth) & (second < plain * largest)
 
 
 def _phases(kinks: Tensor) -> Tensor:

@@ -41,8 +41,6 @@ WIDEST = 1e6
 """Largest trust region, in posterior deviations at the start of the search."""
 RESOLUTION = 1e-12
 """Smallest variance that counts, over that of an output: about that of single precision."""
-WINDOW = 5
-"""Lags over which the autocorrelation is summed, in correlation times."""
 ACCEPTED = 0.15
 """Ratio of the decrease of the objective to that of its quadratic approximation, from which a step
 is made."""
@@ -354,12 +352,18 @@ def root(covariance: NDArray) -> NDArray:
     return directions * np.sqrt(np.maximum(values, 0.0))
 
 
-def correlation_time(residual: NDArray) -> float:
+def correlation_time(residual: NDArray, *, correlation_times: int = 5) -> float:
     """Samples per effective one: the integrated autocorrelation time of residuals (n, T, d_y).
 
     Unlike that of a first-order autoregression, it holds for residuals that oscillate. The sum over
     lags ends at five times its own value (Sokal, "Monte Carlo methods in statistical
     mechanics", in Functional Integration, 1997).
+
+    Parameters
+    ----------
+    correlation_times : int, default 5
+        Lags over which the autocorrelation is summed, in correlation times.
+
     """
     samples = residual.shape[1]
     scale = np.sqrt(np.mean(residual**2, axis=(0, 1)))
@@ -369,7 +373,7 @@ def correlation_time(residual: NDArray) -> float:
     if covariance[0] <= 0:
         return 1.0
     times = 2 * np.cumsum(covariance / covariance[0]) - 1
-    window = np.arange(samples) >= WINDOW * times
+    window = np.arange(samples) >= correlation_times * times
     return float(max(1.0, times[np.argmax(window)] if window.any() else times[-1]))
 
 

@@ -15,8 +15,6 @@ PRIOR_DRAWS = 200
 """Draws from the prior whose simulations the measured data are compared with."""
 NOISES = 32
 """Draws of the noise, each with its own scales, that are added to a simulated path."""
-VALUES_PER_BATCH = 64
-"""Values of the parameters that are simulated in one batch, which bounds the memory."""
 
 
 class BoxProblem:
@@ -74,10 +72,17 @@ class BoxProblem:
             out[inside] = np.where(np.isfinite(each), each, -np.inf)
         return out
 
-    def paths(self, points: NDArray) -> NDArray:
-        """Noise-free outputs (m, n, P, d_y) minus the present ones, in residual units."""
+    def paths(self, points: NDArray, *, values_per_batch: int = 64) -> NDArray:
+        """Noise-free outputs (m, n, P, d_y) minus the present ones, in residual units.
+
+        Parameters
+        ----------
+        values_per_batch : int, default 64
+            Values of the parameters that are simulated in one batch, which bounds the memory.
+
+        """
         theta, _ = self.physical(points)
-        parts = [theta[i : i + VALUES_PER_BATCH] for i in range(0, len(theta), VALUES_PER_BATCH)]
+        parts = [theta[i : i + values_per_batch] for i in range(0, len(theta), values_per_batch)]
         outputs = np.concatenate([self.misfit.outputs(part) for part in parts])
         difference = (outputs - self.misfit.present) / self.misfit.unit
         return np.where(self.misfit.seen, difference, 0.0)

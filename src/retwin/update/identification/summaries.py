@@ -8,10 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.covariance import LedoitWolf
 
-COMPONENTS = 20
-"""Largest number of principal components."""
-RANK_TOLERANCE = 1e-4
-"""Components whose singular value is below this share of the largest are left out."""
 LAGS = (1, 2, 4, 8, 16)
 """Lags, in samples, at which the increments of the noise are summarised."""
 
@@ -33,13 +29,22 @@ class Principal:
     mean: NDArray
 
     @classmethod
-    def of(cls, data: NDArray) -> Principal:
-        """The components of simulated data (m, ...)."""
+    def of(cls, data: NDArray, *, components: int = 20, rank_tolerance: float = 1e-4) -> Principal:
+        """The components of simulated data (m, ...).
+
+        Parameters
+        ----------
+        components : int, default 20
+            Largest number of principal components.
+        rank_tolerance : float, default 1e-4
+            Components whose singular value is below this share of the largest are left out.
+
+        """
         flat = data.reshape(len(data), -1)
         mean = flat.mean(axis=0)
         _, singular, directions = np.linalg.svd(flat - mean, full_matrices=False)
-        kept = singular > RANK_TOLERANCE * singular.max(initial=0.0)
-        return cls(directions[kept][:COMPONENTS], mean)
+        kept = singular > rank_tolerance * singular.max(initial=0.0)
+        return cls(directions[kept][:components], mean)
 
     def __call__(self, data: NDArray, seen: NDArray) -> tuple[NDArray, NDArray]:
         """Scores (m, c) of data (m, ...), and the remainder, which is 0 where not `seen`."""

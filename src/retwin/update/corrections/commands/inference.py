@@ -40,10 +40,6 @@ from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.sample_noise import SampleNoise
 from retwin.workers.threads import one_thread
 
-MAX_ROUNDS = 12
-"""Rounds of expectation-maximisation at most, with a search for missed segments in each."""
-TOLERANCE = 0.02
-"""Relative change of all standard deviations below which they have converged."""
 SUSPECT = 2.5
 """Standard deviations of the prior beyond which an offset makes a segment suspect."""
 MOVING = 3.0
@@ -52,8 +48,6 @@ OUTLYING = 3.0
 """Noise scales beyond which a sample is an outlier."""
 OUTLYING_SHARE = 0.3
 """Share of outliers above which a segment is suspect."""
-FIRST_ODDS = -4.0
-"""Log odds at first that an actuator misses a segment: about one in fifty."""
 FIRST_JITTER = 1 / 35
 """Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
 SMALLEST_SHARE = 0.1
@@ -74,10 +68,19 @@ def infer_commands(
     delay_range: tuple[float, float],
     max_samples: int,
     identified_below: float,
+    max_rounds: int = 12,
+    first_odds: float = -4.0,
 ) -> tuple[Discrepancy, Hyperparameters | None]:
     """z* (n, M, 1 + 2 d_u) for measured outputs (n, T, d_y), see `CommandSpace`.
 
     The range of delays is in samples.
+
+    Parameters
+    ----------
+    max_rounds : int, default 12
+        Rounds of expectation-maximisation at most, with a search for missed segments in each.
+    first_odds : float, default -4.0
+        Log odds at first that an actuator misses a segment: about one in fifty.
 
     Returns
     -------
@@ -103,7 +106,7 @@ def infer_commands(
     replicates = features.replicates(problem)
     uncertain = problem.counted_once(replicates)
     problem = uncertain.where_certain
-    missed = first_missed(problem, features.unit, FIRST_ODDS)
+    missed = first_missed(problem, features.unit, first_odds)
     problem = problem.with_missed(missed)
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
     others = context.others
@@ -125,7 +128,7 @@ def infer_commands(
         if regression and not learned.explained(problem, found.fit, weight):
             break
         learned = learned.with_regression(problem, regression)
-        for _ in range(MAX_ROUNDS):
+        for _ in range(max_rounds):
             found, before = infer(found, learned), learned
             missed, solution = found.fit.missed, found.fit.solution
             learned = before.learned(problem.with_missed(missed), solution, weight)
@@ -331,13 +334,20 @@ class Hyperparameters:
         thinning = torch.stack([rest, path])
         return replace(learned, scale=learned.scale / left.sqrt(), thinning=thinning)
 
-    def near(self, other: Hyperparameters) -> bool:
-        """Whether all standard deviations are about those of `other`."""
+    def near(self, other: Hyperparameters, *, tolerance: float = 0.02) -> bool:
+        """Whether all standard deviations are about those of `other`.
+
+        Parameters
+        ----------
+        tolerance : float, default 0.02
+            Relative change of all standard deviations below which they have converged.
+
+        """
         pairs = (
             (self.hierarchy.total().sqrt(), other.hierarchy.total().sqrt()),
             (self.noise.scale, other.noise.scale),
         )
-        return all(bool(((a / b).log().abs() < TOLERANCE).all()) for a, b in pairs)
+        return all(bool(((a / b).log().abs() < tolerance).all()) for a, b in pairs)
 
 
 def _discrepancy(
