@@ -6,17 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from retwin.checks import require
+from retwin.cli import options
 from retwin.cli.commands import Commands
-from retwin.cli.options import (
-    Json,
-    OtherCase,
-    Seed,
-    argument,
-    channel_names,
-    leave_out,
-    option,
-    rare,
-)
+from retwin.cli.options import argument, leave_out, option, rare
 from retwin.cli.reading import saved, system_of, updated_twin
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.errors import InputError
@@ -45,8 +37,8 @@ def fmu(
     source_only: Annotated[
         bool, rare("", "Write no binary for this machine.", "--source-only")
     ] = False,
-    case: OtherCase = None,
-    as_json: Json = False,
+    case: options.OtherCase = None,
+    as_json: options.Json = False,
 ) -> None:
     """Write an updated twin as an FMU with C source code inside."""
     from retwin.deploy.fmu.export import export_fmu
@@ -85,7 +77,7 @@ def fmu(
 def onnx(
     folder: Annotated[Path, argument("BUNDLE", "Folder of a bundle, of retwin bundle save.")],
     out: Annotated[Path, option("FOLDER", "Where to put the ONNX graphs.")],
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> None:
     """Write a bundle as ONNX graphs, with which `diagnose predict` needs no torch."""
     from retwin.deploy.bundle.bundle import Bundle
@@ -123,9 +115,9 @@ def actuator(
         ),
     ] = None,
     history: Annotated[str | None, rare("STEPS", "Of --torque, into the past; else 0,1,2.")] = None,
-    case: OtherCase = None,
-    seed: Seed = 0,
-    as_json: Json = False,
+    case: options.OtherCase = None,
+    seed: options.Seed = 0,
+    as_json: options.Json = False,
 ) -> None:
     """Write what the actuators execute, for many simulated robots at once.
 
@@ -184,7 +176,7 @@ def _joint(text: str) -> Joint:
     """The channels in a value of --torque."""
     from retwin.deploy.actuator.torque_net import Joint
 
-    names = channel_names(text)
+    names = options.channel_names(text)
     require(
         len(names) in (3, 4) and len(names) == text.count(",") + 1,
         "--torque",

@@ -9,17 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from retwin import catalog
 from retwin.checks import given, one_of, require
-from retwin.cli.options import (
-    CaseArgument,
-    Horizon,
-    Json,
-    LogMapping,
-    MaxBytes,
-    Seed,
-    option,
-    rare,
-    seconds_of,
-)
+from retwin.cli import options
+from retwin.cli.options import option, rare
 from retwin.cli.reading import read, shown_records, stored_name
 from retwin.cli.terminal import Interrupted, answer, bar, note, table
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -59,16 +50,16 @@ Refine = Annotated[bool, rare("", "Fine-tune on outputs afterwards.", "--refine"
 
 
 def fit(
-    case: CaseArgument,
+    case: options.CaseArgument,
     real: RealSet,
     out: ModelFolder,
-    horizon: Horizon = "free",
+    horizon: options.Horizon = "free",
     dynamics: StateEquations = False,
     correction: Correction = None,
     prior: Prior = None,
-    mapping: LogMapping = None,
-    seed: Seed = 0,
-    as_json: Json = False,
+    mapping: options.LogMapping = None,
+    seed: options.Seed = 0,
+    as_json: options.Json = False,
     compare: Compare = True,
     yardstick: Yardstick = None,
     surrogate: SurrogateMode = "auto",
@@ -78,7 +69,7 @@ def fit(
     network: Network = None,
     density: Density = None,
     refine: Refine = False,
-    max_bytes: MaxBytes = None,
+    max_bytes: options.MaxBytes = None,
 ) -> None:
     """Update a twin by real records; save the updated twin.
 
@@ -93,7 +84,7 @@ def fit(
     from retwin.update.residual.priors import other_machines
 
     check_place(out, folder=True, holds=HOLDS)
-    seconds = seconds_of("--horizon", horizon)
+    seconds = options.seconds_of("--horizon", horizon)
     one_of("--surrogate", surrogate, catalog.SURROGATE_MODES)
     require(
         not dynamics or (correction is network is twin_data is None and calibrate_on == "healthy"),

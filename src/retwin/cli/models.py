@@ -11,30 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from retwin.checks import require
-from retwin.cli.options import (
-    Horizon,
-    Json,
-    LogMapping,
-    MaxBytes,
-    Model,
-    OtherCase,
-    Seed,
-    WarmUp,
-    argument,
-    leave_out,
-    option,
-    seconds_of,
-)
+from retwin.cli import options, reading
+from retwin.cli.options import argument, leave_out, option
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import (
-    fitted_remarks,
-    read,
-    read_commands,
-    source_of,
-    system_of,
-    unstable_remarks,
-    updated_twin,
-)
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import Trajectories
@@ -56,11 +35,11 @@ def generate(
         bool, option("", "Write mean and 90 % band of --commands, also as *.png.", "--bands")
     ] = False,
     per_class: Annotated[int, option("N", "Trajectories per class.")] = 400,
-    case: OtherCase = None,
-    seed: Seed = 0,
+    case: options.OtherCase = None,
+    seed: options.Seed = 0,
     workers: Workers = None,
-    warm_up: WarmUp = "",
-    mapping: LogMapping = None,
+    warm_up: options.WarmUp = "",
+    mapping: options.LogMapping = None,
 ) -> None:
     """Generate trajectories, or predictions of commands.
 
@@ -76,19 +55,19 @@ def generate(
         got=f"--commands {commands}, --out {out}",
         remedy="bands are those of given commands",
     )
-    for text in unstable_remarks(model):
+    for text in reading.unstable_remarks(model):
         note(text)
     if bands:
         check_place(out)
         check_place(out.with_suffix(".png"))
-        begin = seconds_of("--warm-up", warm_up or "free") or 0.0
+        begin = options.seconds_of("--warm-up", warm_up or "free") or 0.0
         _write_bands(model, commands, out, case, seed, mapping, begin)  # type: ignore[arg-type]
         return
     leave_out({"--warm-up": warm_up or None}, "without --bands")
     kind = check_target(out)
-    updated, system = source_of(model, case)
+    updated, system = reading.source_of(model, case)
     if commands is not None:
-        records = read_commands(commands, system, mapping=mapping)
+        records = reading.read_commands(commands, system, mapping=mapping)
         rt.save(updated.simulate(records.commands.astype(float), seed=seed), out)
         note(f"Wrote {len(records)} trajectories to {out}")
         return
@@ -119,8 +98,8 @@ def _write_bands(
     from retwin.report.choice.page import draw_prediction
     from retwin.report.figures.png import png
 
-    updated, system = source_of(model, case)
-    records = read_commands(commands, system, mapping=mapping)
+    updated, system = reading.source_of(model, case)
+    records = reading.read_commands(commands, system, mapping=mapping)
     _note_start(updated, records, begin)
     found = predict_records(updated, records, started=begin, seed=seed)
     write_predictions(found, records, out)
@@ -150,30 +129,30 @@ def write_predictions(found: ScoredPrediction, records: Trajectories, out: Path)
 
 
 def evaluate(
-    model: Model,
+    model: options.Model,
     real: Annotated[list[Path], option("FILE", "Records it was not fitted to; may be repeated.")],
-    horizon: Horizon = "free",
-    warm_up: WarmUp = "",
+    horizon: options.Horizon = "free",
+    warm_up: options.WarmUp = "",
     out: Annotated[Path | None, option("FILE", "CSV file of predictions with bands.")] = None,
-    case: OtherCase = None,
-    seed: Seed = 0,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
-    as_json: Json = False,
+    case: options.OtherCase = None,
+    seed: options.Seed = 0,
+    mapping: options.LogMapping = None,
+    max_bytes: options.MaxBytes = None,
+    as_json: options.Json = False,
 ) -> None:
     """Score an updated twin on other records."""
     from retwin.evaluation import predict_records, score_model
 
-    ahead = seconds_of("--horizon", horizon)
-    begin = seconds_of("--warm-up", warm_up or "free") or 0.0
+    ahead = options.seconds_of("--horizon", horizon)
+    begin = options.seconds_of("--warm-up", warm_up or "free") or 0.0
     if out is not None:
         check_place(out)
-    updated = updated_twin(model)
-    system = system_of(updated, model, case)
-    records = read(real, system, part="test", max_bytes=max_bytes, mapping=mapping)
+    updated = reading.updated_twin(model)
+    system = reading.system_of(updated, model, case)
+    records = reading.read(real, system, part="test", max_bytes=max_bytes, mapping=mapping)
     if begin:
         _note_start(updated, records, begin)
-    unstable = [] if ahead else unstable_remarks(model)
+    unstable = [] if ahead else reading.unstable_remarks(model)
     scores = score_model(
         updated, records, horizon=ahead, warm_up=begin, started=begin, twin=system.twin, seed=seed
     )
@@ -204,7 +183,7 @@ def evaluate(
         table(heads, rows, numbers=heads[2:6]),
         *unstable,
         *_verdict(scores, started=bool(begin)),
-        *fitted_remarks(model, records, "these are no scores of new ones"),
+        *reading.fitted_remarks(model, records, "these are no scores of new ones"),
         *begins,
         as_json=as_json,
     )

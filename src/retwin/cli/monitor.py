@@ -21,17 +21,9 @@ import typer
 
 from retwin import catalog
 from retwin.checks import at_least, existing, finite, positive, require
+from retwin.cli import options
 from retwin.cli.commands import Commands
-from retwin.cli.options import (
-    Json,
-    LogMapping,
-    MaxBytes,
-    OtherCase,
-    argument,
-    leave_out,
-    option,
-    rare,
-)
+from retwin.cli.options import argument, leave_out, option, rare
 from retwin.cli.reading import (
     case_named,
     fitted_remarks,
@@ -91,10 +83,10 @@ def fit(
     lasting: Annotated[
         float | None, option("S", "Time after which an event is a lasting change: 3600.")
     ] = None,
-    case: OtherCase = None,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
-    as_json: Json = False,
+    case: options.OtherCase = None,
+    mapping: options.LogMapping = None,
+    max_bytes: options.MaxBytes = None,
+    as_json: options.Json = False,
 ) -> None:
     """Calibrate a monitor on healthy records, best not those that MODEL was fitted to.
 
@@ -196,10 +188,10 @@ def _describe_visible(visible: Sequence[Visible]) -> list[str]:
 def replay(
     monitor: Annotated[Path, argument("MONITOR", "Folder of a monitor, of retwin monitor fit.")],
     logs: Annotated[list[Path], argument("LOG...", "Records, in the order of time.")],
-    case: OtherCase = None,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
-    as_json: Json = False,
+    case: options.OtherCase = None,
+    mapping: options.LogMapping = None,
+    max_bytes: options.MaxBytes = None,
+    as_json: options.Json = False,
 ) -> None:
     """Watch recorded data as if they came now: alarms, their causes, and the promise."""
     from retwin.monitor import Monitor
@@ -380,7 +372,7 @@ def audit(
     store: Annotated[Path, argument("STORE", "Folder of the store, or an exported log.")],
     head: Annotated[str | None, rare("HASH", "A former head that was kept elsewhere.")] = None,
     url: Annotated[str, rare("URL", "The PostgreSQL database, if one.")] = "",
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> None:
     """Verify the log of a store, and the files of its versions."""
     from retwin.monitor import Store, read_log, verify
@@ -420,7 +412,7 @@ def recalibrate(
         str, option("NAME", "You, if a change that lasts is no fault but the new normal.")
     ] = "",
     url: Annotated[str, rare("URL", "The PostgreSQL database, if one.")] = "",
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> None:
     """Propose a monitor of the last quiet hours, in the shadow of the active one."""
     from retwin.monitor import Store

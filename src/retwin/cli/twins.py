@@ -10,21 +10,11 @@ from retwin import twins
 from retwin.catalog import CASES, TWINS
 from retwin.catalog.modules import known
 from retwin.checks import agree, given, require
+from retwin.cli import options
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_faults, complete_twins
 from retwin.cli.films import draw_film, film_settings
-from retwin.cli.options import (
-    Inputs,
-    Json,
-    MaxBytes,
-    Outputs,
-    Seed,
-    argument,
-    channel_names,
-    leave_out,
-    option,
-    rare,
-)
+from retwin.cli.options import argument, leave_out, option, rare
 from retwin.cli.plans import Scheduler, Workers, carry_out
 from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, example, table
@@ -67,12 +57,12 @@ def info(
     twin: Annotated[
         str | None, argument("TWIN", "Else all are listed.", autocompletion=complete_twins)
     ] = None,
-    inputs: Inputs = "",
-    outputs: Outputs = "",
+    inputs: options.Inputs = "",
+    outputs: options.Outputs = "",
     rate: Rate = None,
     servo: Servos = None,
     no_meshes: NoMeshes = False,
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> None:
     """Describe a twin: its inputs with their limits, its outputs, its rate.
 
@@ -157,7 +147,7 @@ def simulate(
     fault: Annotated[
         str, option("NAME", "A class, all (in turn), or none.", autocompletion=complete_faults)
     ] = "none",
-    seed: Seed = 0,
+    seed: options.Seed = 0,
     film: Annotated[
         Path | None, option("FILE", "Film of --out, else of --commands: *.mp4 or *.gif.")
     ] = None,
@@ -172,8 +162,8 @@ def simulate(
     duration: Annotated[
         float | None, rare("SECONDS", "Of commands that no case draws.", min=1e-9)
     ] = None,
-    inputs: Inputs = "",
-    outputs: Outputs = "",
+    inputs: options.Inputs = "",
+    outputs: options.Outputs = "",
     rate: Rate = None,
     servo: Servos = None,
     no_meshes: NoMeshes = False,
@@ -181,7 +171,7 @@ def simulate(
     workers: Workers = None,
     scheduler: Scheduler = None,
     chunk: Annotated[int, rare("N", "Trajectories per chunk.", min=1)] = 256,
-    max_bytes: MaxBytes = None,
+    max_bytes: options.MaxBytes = None,
 ) -> None:
     """Simulate trajectories to a file, or film one.
 
@@ -224,10 +214,10 @@ def _twin(
     no_meshes: bool,
 ) -> Twin:
     """The twin of that name, or the model in that folder."""
-    options: dict[str, Any] = {"meshes": False} if no_meshes else {}
+    settings: dict[str, Any] = {"meshes": False} if no_meshes else {}
     if servos:
-        options["servos"] = list(map(_servo, servos))
-    own = not (inputs or outputs or rate or options)
+        settings["servos"] = list(map(_servo, servos))
+    own = not (inputs or outputs or rate or settings)
     if own and (recover(name) / "model.json").is_file():
         return _model(Path(name))
     if _is_case(name) and own:
@@ -235,7 +225,11 @@ def _twin(
 
         return cases.get(name).twin
     return twins.get(
-        name, inputs=channel_names(inputs), outputs=channel_names(outputs), rate=rate, **options
+        name,
+        inputs=options.channel_names(inputs),
+        outputs=options.channel_names(outputs),
+        rate=rate,
+        **settings,
     )
 
 

@@ -23,14 +23,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
-from retwin.update.blackbox.estimate import (
-    BlackBox,
-    BlackBoxFit,
-    best_order,
-    check_records,
-    estimation_of,
-    with_best_prior,
-)
+from retwin.update.blackbox import estimate
 from retwin.update.blackbox.lags import ROWS_PER_TERM, Lags, least_squares
 from retwin.update.dynamics.estimation import Estimation, Point
 from retwin.update.dynamics.unknowns import coefficients_of
@@ -51,15 +44,15 @@ DISTINCT = 1e-5
 """Norm of what a term of norm 1 has beyond the chosen ones, below which it is a combination."""
 
 
-def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> BlackBox:
+def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> estimate.BlackBox:
     """The polynomial model of past outputs and commands; it needs no seed.
 
     Forward regression adds nonlinear terms to the linear ones, by the share of the variance that
     each explains beyond those before it. They have a Gaussian prior about 0.
     """
-    check_records(observed)
+    estimate.check_records(observed)
     orders = range(1, MAX_ORDER + 1)
-    order, found = best_order(
+    order, found = estimate.best_order(
         orders, lambda n: Polynomial(Lags(observed, n, DEGREE)).fit(), progress
     )
     return found.model(order, len(observed.outputs))
@@ -117,24 +110,24 @@ class Polynomial:
         numbers = (each.tolist() for each in columns)
         return [State(*each) for each in zip(lags.names, units, *numbers, strict=True)]
 
-    def fit(self) -> BlackBoxFit | None:
+    def fit(self) -> estimate.BlackBoxFit | None:
         """The model; None where samples are too few or the linear model diverges."""
         if not self.lags.enough:
             return None
         observed, chosen, linear = self.lags.observed, self.chosen(), self.linear
 
-        def start(part: NDArray) -> BlackBoxFit:
+        def start(part: NDArray) -> estimate.BlackBoxFit:
             kept = self.lags.rows.without(part)
             coefficients = np.zeros((len(chosen), max(map(len, chosen))))
             columns = kept.values[:, linear]
             coefficients[:, linear] = [least_squares(columns, y) for y in kept.outputs.T]
             pairs = zip(coefficients, chosen, strict=True)
             flat = np.concatenate([own[: len(terms)] for own, terms in pairs])
-            estimation = estimation_of(self.twin(chosen, flat), observed, part)
+            estimation = estimate.estimation_of(self.twin(chosen, flat), observed, part)
             estimation = self._with_prior(estimation, chosen)
-            return BlackBoxFit(estimation, Point(flat, self.starts), np.empty(0))
+            return estimate.BlackBoxFit(estimation, Point(flat, self.starts), np.empty(0))
 
-        return with_best_prior(start, observed.mask)
+        return estimate.with_best_prior(start, observed.mask)
 
     @property
     def linear(self) -> list[int]:
