@@ -177,14 +177,11 @@ def _joint(text: str) -> Joint:
     from retwin.deploy.actuator.torque_net import Joint
 
     names = options.channel_names(text)
-    require(
-        len(names) in (3, 4) and len(names) == text.count(",") + 1,
-        "--torque",
-        expected="TARGET,POSITION,TORQUE or TARGET,POSITION,TORQUE,VELOCITY",
-        got=repr(text),
-        remedy="name a command and two or three outputs of the twin; `retwin data info` of its "
-        "calibration data lists them",
-    )
+    complete = len(names) in (3, 4) and len(names) == text.count(",") + 1
+    expected = "TARGET,POSITION,TORQUE or TARGET,POSITION,TORQUE,VELOCITY"
+    remedy = "name a command and two or three outputs of the twin; `retwin data info` of its "
+    remedy += "calibration data lists them"
+    require(complete, "--torque", expected=expected, got=repr(text), remedy=remedy)
     return Joint(*names)
 
 

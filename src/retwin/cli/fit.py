@@ -99,13 +99,10 @@ def fit(
     measured = _labelled(system, measured)
     faults = system.faults if calibrate_on == "all" else calibrate_on
     calibrating(measured, faults)  # before a surrogate is trained, which takes minutes
-    require(
-        compare or system.diagnosed or dynamics or correction is not None,
-        "--no-compare",
-        expected="--dynamics or --correction with it, or a case with classes, whose own is taken",
-        got="neither",
-        remedy="name a method, or let the candidates be compared",
-    )
+    decided = compare or system.diagnosed or dynamics or correction is not None
+    expected = "--dynamics or --correction with it, or a case with classes, whose own is taken"
+    remedy = "name a method, or let the candidates be compared"
+    require(decided, "--no-compare", expected=expected, got="neither", remedy=remedy)
     forced = system.diagnosed or correction is not None or not compare or faults != "healthy"
     method = "dynamics" if dynamics else _own(system) if forced else ""
     trained = system.diagnosed or refine or any((network, twin_data, simulations))

@@ -206,13 +206,10 @@ def _columns(column: list[str] | None, time: str | None, transient: float) -> Co
     names = {}
     for text in column or ():
         channel, _, name = text.partition("=")
-        require(
-            channel and name and channel not in names,
-            "--column",
-            expected="CHANNEL=COLUMN, each channel once",
-            got=repr(text),
-            remedy="write for instance --column speed=omega_measured",
-        )
+        paired = channel and name and channel not in names
+        expected = "CHANNEL=COLUMN, each channel once"
+        remedy = "write for instance --column speed=omega_measured"
+        require(paired, "--column", expected=expected, got=repr(text), remedy=remedy)
         names[channel] = name
     return Columns(names, time_column(time or "", "--time"), transient)
 

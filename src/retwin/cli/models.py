@@ -48,13 +48,11 @@ def generate(
     """
     import retwin as rt
 
-    require(
-        not bands or (commands is not None and out.suffix.lower() == ".csv"),
-        "--bands",
-        expected="--commands FILE and --out FILE.csv",
-        got=f"--commands {commands}, --out {out}",
-        remedy="bands are those of given commands",
-    )
+    possible = not bands or (commands is not None and out.suffix.lower() == ".csv")
+    expected = "--commands FILE and --out FILE.csv"
+    got = f"--commands {commands}, --out {out}"
+    remedy = "bands are those of given commands"
+    require(possible, "--bands", expected=expected, got=got, remedy=remedy)
     for text in reading.unstable_remarks(model):
         note(text)
     if bands:

@@ -378,13 +378,10 @@ def audit(
     from retwin.monitor import Store, read_log, verify
     from retwin.monitor.versions.registry import damaged
 
-    require(
-        head is None or re.fullmatch("[0-9a-f]{64}", head),
-        "--head",
-        expected="64 hexadecimal digits",
-        got=repr(head)[:80],
-        remedy="give the head that this command printed",
-    )
+    hexadecimal = head is None or re.fullmatch("[0-9a-f]{64}", head)
+    expected = "64 hexadecimal digits"
+    remedy = "give the head that this command printed"
+    require(hexadecimal, "--head", expected=expected, got=repr(head)[:80], remedy=remedy)
     if store.is_file():
         found, reason = verify(read_log(store), head), ""
     else:

@@ -104,13 +104,11 @@ def opened(path: Path, encoding: str) -> TextIO:
 def lines_of(file: TextIO, path: Path) -> Iterator[str]:
     """Lines of bounded length without zero characters."""
     while line := file.readline(LONGEST):
-        require(
-            len(line) < LONGEST and "\0" not in line,
-            path.name,
-            expected=f"lines of text of less than {LONGEST} characters",
-            got="a longer one" if len(line) == LONGEST else "a zero byte",
-            remedy="check that it is a text table, and whole",
-        )
+        textual = len(line) < LONGEST and "\0" not in line
+        expected = f"lines of text of less than {LONGEST} characters"
+        got = "a longer one" if len(line) == LONGEST else "a zero byte"
+        remedy = "check that it is a text table, and whole"
+        require(textual, path.name, expected=expected, got=got, remedy=remedy)
         yield line
 
 

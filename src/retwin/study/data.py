@@ -56,13 +56,10 @@ class StudyData:
     def __post_init__(self) -> None:
         stated = {name for name, file in vars(self).items() if file is not None} - {"twin"}
         mapped = stated & {"calibration", "test", "real"}
-        require(
-            self.mapping is None or mapped,
-            "mapping",
-            expected="real sets that are logs",
-            got=", ".join(sorted(stated - {"mapping"})) or "none",
-            remedy="give --real LOG, or --calibration LOG --test LOG; or leave the mapping out",
-        )
+        usable = self.mapping is None or mapped
+        got = ", ".join(sorted(stated - {"mapping"})) or "none"
+        remedy = "give --real LOG, or --calibration LOG --test LOG; or leave the mapping out"
+        require(usable, "mapping", expected="real sets that are logs", got=got, remedy=remedy)
         stated -= {"mapping"}
         fits = stated in ({"calibration", "test"}, {"real"}, {"records"}, set())
         expected = "either calibration and test, or real alone, or records alone"

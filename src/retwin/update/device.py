@@ -76,13 +76,11 @@ class DeviceTwin:
 
     def __init__(self, twin: CorrectedTwin, device: str | torch.device) -> None:
         instance("twin", twin, CorrectedTwin, remedy="fit a residual model, and give CorrectedTwin")
-        require(
-            isinstance(twin.surrogate, Surrogate),
-            "twin",
-            expected="a corrected twin with a neural surrogate",
-            got=f"one with {type(twin.surrogate).__name__} in its place",
-            remedy="train one with fit_surrogate, or simulate this twin on the processor",
-        )
+        neural = isinstance(twin.surrogate, Surrogate)
+        expected = "a corrected twin with a neural surrogate"
+        got = f"one with {type(twin.surrogate).__name__} in its place"
+        remedy = "train one with fit_surrogate, or simulate this twin on the processor"
+        require(neural, "twin", expected=expected, got=got, remedy=remedy)
         self.twin = twin
         self.device = _usable(device)
         self._surrogate = copy.deepcopy(twin.surrogate).to(self.device)

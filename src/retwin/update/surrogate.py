@@ -245,13 +245,11 @@ def fit_surrogate(
     """
     instance("twin", twin, Trajectories, remedy="simulate the twin, and give what it returns")
     channels = twin.commands.shape[2]
-    require(
-        len(twin) >= MIN_TRAJECTORIES and channels,
-        "twin",
-        expected=f"at least {MIN_TRAJECTORIES} trajectories with commands",
-        got=f"{len(twin)} trajectories with {channels} command channels",
-        remedy="load the file with its case, which recovers commands, or simulate more",
-    )
+    enough = len(twin) >= MIN_TRAJECTORIES and channels
+    expected = f"at least {MIN_TRAJECTORIES} trajectories with commands"
+    got = f"{len(twin)} trajectories with {channels} command channels"
+    remedy = "load the file with its case, which recovers commands, or simulate more"
+    require(enough, "twin", expected=expected, got=got, remedy=remedy)
     order = np.random.default_rng(seed).permutation(len(twin))
     tenth = min(max(1, len(twin) // 10), MAX_HELD_OUT)
     test, valid, fitted = order[:tenth], order[tenth : 2 * tenth], order[2 * tenth :]

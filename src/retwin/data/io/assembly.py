@@ -205,13 +205,10 @@ def settle(
         units = zip(channels.units, wanted.units, strict=False)
         open_units = not case.classes and all(b in (a, "1") for a, b in units)
         same = channels.names == wanted.names and open_units
-        require(
-            channels in (wanted, unnamed) or same,
-            name,
-            expected=f"the channels of the case, {wanted}",
-            got=channels,
-            remedy="give the case that the data belong to",
-        )
+        alike = channels in (wanted, unnamed) or same
+        expected = f"the channels of the case, {wanted}"
+        remedy = "give the case that the data belong to"
+        require(alike, name, expected=expected, got=channels, remedy=remedy)
     unknown = sorted(trajectories.known_labels - set(case.classes))
     expected = f"classes of the case, {', '.join(case.classes)}"
     got = f"the unknown class {''.join(unknown[:1])!r}"

@@ -167,13 +167,11 @@ def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None,
     if not series or any(data is None for data, _ in series):
         return None, None
     vectors = [data for data, _ in series if data is not None]
-    require(
-        all(len(data) == steps for data in vectors),
-        where,
-        expected=f"{steps} samples per motor, as trajCmds",
-        got=", ".join(str(len(data)) for data in vectors),
-        remedy="sample commands and paths on the same grid",
-    )
+    aligned = all(len(data) == steps for data in vectors)
+    expected = f"{steps} samples per motor, as trajCmds"
+    got = ", ".join(str(len(data)) for data in vectors)
+    remedy = "sample commands and paths on the same grid"
+    require(aligned, where, expected=expected, got=got, remedy=remedy)
     rates = {round(rate, 3) for _, rate in series if rate is not None}
     got = ", ".join(f"{rate:g} Hz" for rate in sorted(rates))
     remedy = "sample all motors on the same grid"

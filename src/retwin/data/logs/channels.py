@@ -252,13 +252,10 @@ def in_order(signal: Signal, where: str, *, disorder: float = 10.0) -> tuple[Sig
     worst = int(np.argmin(steps))
     even = np.mean(np.abs(np.delete(steps, worst) - typical) <= EVEN * typical) > 1 - EVEN
     repeated = abs(HOUR + steps[worst] - typical) <= EVEN * typical and even
-    require(
-        (abs(HOUR + steps[worst]) > 1.5 * typical or steps[worst] >= -typical) and not repeated,
-        place,
-        expected="times of a clock that nobody sets",
-        got=f"one hour twice, at {times[worst]:g} s, as at the end of summer time",
-        remedy="record UTC, or add its offset to each time (+02:00), or split the log there",
-    )
+    steady = (abs(HOUR + steps[worst]) > 1.5 * typical or steps[worst] >= -typical) and not repeated
+    got = f"one hour twice, at {times[worst]:g} s, as at the end of summer time"
+    remedy = "record UTC, or add its offset to each time (+02:00), or split the log there"
+    require(steady, place, expected="times of a clock that nobody sets", got=got, remedy=remedy)
     expected = "times that increase"
     got = f"a step back of {-steps[worst]:g} s at {times[worst]:g} s"
     remedy = "split the log there, or give other times in [time] of a mapping: rate = … in "

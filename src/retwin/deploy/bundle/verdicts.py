@@ -173,14 +173,12 @@ class Domain:
             widths = [np.subtract(self.high, self.low), np.subtract(self.ceiling, self.floor)]
         numbers = [getattr(self, each.name) for each in fields(self)]
         sizes = [*widths, self.speed, self.spread, self.mismatch]
-        require(
-            all(np.isfinite(each).all() for each in [*numbers, *widths])
-            and all(np.greater_equal(each, 0).all() for each in sizes),
-            "domain",
-            expected="finite ranges and limits, none of them negative",
-            got=self,
-            remedy="make the bundle and its export anew",
+        sound = all(np.isfinite(each).all() for each in [*numbers, *widths]) and all(
+            np.greater_equal(each, 0).all() for each in sizes
         )
+        expected = "finite ranges and limits, none of them negative"
+        remedy = "make the bundle and its export anew"
+        require(sound, "domain", expected=expected, got=self, remedy=remedy)
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Domain:

@@ -104,21 +104,15 @@ class StateInversionDiagnoser:
     """
 
     def __init__(self, twin: DynamicsTwin, faults: Mapping[str, Fault | None]) -> None:
-        require(
-            len(faults) > 1 and sum(each is None for each in faults.values()) == 1,
-            "faults",
-            expected="one healthy class, None, and faults",
-            got=faults,
-            remedy='give for instance {"Healthy": None, "leak": ParameterShift(...)}',
-        )
+        complete = len(faults) > 1 and sum(each is None for each in faults.values()) == 1
+        expected = "one healthy class, None, and faults"
+        remedy = 'give for instance {"Healthy": None, "leak": ParameterShift(...)}'
+        require(complete, "faults", expected=expected, got=faults, remedy=remedy)
         for fault in faults.values():
-            require(
-                fault is None or isinstance(fault, TimedFault),
-                "faults",
-                expected=f"None, or one of {', '.join(each.__name__ for each in KINDS)}",
-                got=repr(fault),
-                remedy="leave out what cannot be inverted, or train a diagnoser",
-            )
+            invertible = fault is None or isinstance(fault, TimedFault)
+            expected = f"None, or one of {', '.join(each.__name__ for each in KINDS)}"
+            remedy = "leave out what cannot be inverted, or train a diagnoser"
+            require(invertible, "faults", expected=expected, got=repr(fault), remedy=remedy)
         check_faults(list(faults.values()), len(twin.inputs), len(twin.outputs), twin.shiftable)
         self.twin = twin
         self.classes = tuple(faults)

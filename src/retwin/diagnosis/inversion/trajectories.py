@@ -290,13 +290,10 @@ class InversionDiagnoser:
         """The pairs of stuck actuators that are tried, by the names of their classes."""
         one_of("max_faults", max_faults, (1, 2))
         pairs = stuck_pairs(self.faults) if max_faults > 1 else {}
-        require(
-            max_faults == 1 or len(pairs) > 0,
-            "max_faults",
-            expected="1 for a diagnoser without two actuators that can be stuck",
-            got=max_faults,
-            remedy="add their classes to its faults",
-        )
+        possible = max_faults == 1 or len(pairs) > 0
+        expected = "1 for a diagnoser without two actuators that can be stuck"
+        remedy = "add their classes to its faults"
+        require(possible, "max_faults", expected=expected, got=max_faults, remedy=remedy)
         return pairs
 
     def save(self, folder: str | Path) -> None:

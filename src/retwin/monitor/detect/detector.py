@@ -206,13 +206,11 @@ class Detector:
         """Lower and upper ends (streams, T) of scores, which are checked."""
         low = np.asarray(score, dtype=float)
         top = low if high is None else np.asarray(high, dtype=float)
-        require(
-            low.ndim == 2 and low.shape == top.shape and len(low) == len(previous),
-            "score",
-            expected=f"scores of {len(previous)} streams, upper ends of the same shape",
-            got=f"shapes {low.shape} and {top.shape}",
-            remedy="start a state for as many streams as there are",
-        )
+        fits = low.ndim == 2 and low.shape == top.shape and len(low) == len(previous)
+        expected = f"scores of {len(previous)} streams, upper ends of the same shape"
+        got = f"shapes {low.shape} and {top.shape}"
+        remedy = "start a state for as many streams as there are"
+        require(fits, "score", expected=expected, got=got, remedy=remedy)
         expected = "lower ends of intervals that are not above the upper ones"
         got = "at least one that is"
         remedy = "give what `ConformalScores.score` returns, in its order"

@@ -102,13 +102,10 @@ class Disturbance:
 
         """
         given = np.asarray(residual, dtype=float)
-        require(
-            given.ndim == 2 and len(given) == len(self.mean),
-            "residual",
-            expected=f"residuals of {len(self.mean)} streams",
-            got=f"shape {given.shape}",
-            remedy="give one row per stream of the calibration",
-        )
+        fits = given.ndim == 2 and len(given) == len(self.mean)
+        expected = f"residuals of {len(self.mean)} streams"
+        remedy = "give one row per stream of the calibration"
+        require(fits, "residual", expected=expected, got=f"shape {given.shape}", remedy=remedy)
         mean = state.mean.T.copy()
         covariance = np.moveaxis(state.covariance, 0, -1).copy()
         errors, deviation = np.empty((2, *given.shape[::-1]))
@@ -155,13 +152,10 @@ def fit_disturbance(
         remedy="calibrate on a longer healthy record",
     )
     mean, scale = np.nanmean(given, axis=1), np.nanstd(given, axis=1)
-    require(
-        np.all(scale > 1e-12 * np.abs(mean)),
-        "residual",
-        expected="residuals that vary in each stream",
-        got=f"a constant in stream {np.argmin(scale)}",
-        remedy="leave out a channel that does not move",
-    )
+    vary = np.all(scale > 1e-12 * np.abs(mean))
+    got = f"a constant in stream {np.argmin(scale)}"
+    remedy = "leave out a channel that does not move"
+    require(vary, "residual", expected="residuals that vary in each stream", got=got, remedy=remedy)
     if isinstance(folds, int):
         folds = np.array_split(np.arange(given.shape[1]), whole("folds", folds, at_least=2))
     fewest = min((seen.sum(axis=1) - seen[:, each].sum(axis=1)).min() for each in folds)

@@ -70,13 +70,10 @@ class ConformalScores:
 
         """
         given = np.asarray(errors, dtype=float)
-        require(
-            given.ndim and len(given) == len(self.independent),
-            "errors",
-            expected=f"errors of {len(self.independent)} streams",
-            got=f"shape {given.shape}",
-            remedy="give one row per stream of the calibration",
-        )
+        fits = given.ndim and len(given) == len(self.independent)
+        expected = f"errors of {len(self.independent)} streams"
+        remedy = "give one row per stream of the calibration"
+        require(fits, "errors", expected=expected, got=f"shape {given.shape}", remedy=remedy)
         streams = np.arange(len(given)).reshape(-1, *(1,) * (given.ndim - 1))
         half = np.asarray(width, dtype=float) / 2 if self.copies > 1 else 0.0
         missing = np.isnan(given + half)
@@ -138,13 +135,11 @@ def fit_scores(errors: ArrayLike, width: ArrayLike = 0.0) -> ConformalScores:
     given = np.asarray(errors, dtype=float)
     widths = np.broadcast_to(np.asarray(width, dtype=float), given.shape)
     seen = np.isfinite(given) & np.isfinite(widths)
-    require(
-        given.ndim == 2 and given.size and seen.sum(axis=-1).min() >= MIN_ERRORS,
-        "errors",
-        expected=f"an array (streams, T) with at least {MIN_ERRORS} finite errors per stream",
-        got=f"shape {given.shape}" + (f" with {seen.sum(axis=-1).min()}" if given.size else ""),
-        remedy="calibrate on a longer healthy record",
-    )
+    enough = given.ndim == 2 and given.size and seen.sum(axis=-1).min() >= MIN_ERRORS
+    expected = f"an array (streams, T) with at least {MIN_ERRORS} finite errors per stream"
+    got = f"shape {given.shape}" + (f" with {seen.sum(axis=-1).min()}" if given.size else "")
+    remedy = "calibrate on a longer healthy record"
+    require(enough, "errors", expected=expected, got=got, remedy=remedy)
     rounded = bool(np.any(widths[seen] > 0))
     copies = COPIES if rounded else 1
     rows = [

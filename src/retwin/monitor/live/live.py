@@ -178,13 +178,11 @@ class Live:
         """
         for each in batch:
             width = self._one(each.asset).asset.channels
-            require(
-                each.values.ndim == 2 and each.values.shape[1] == width,
-                f"samples of {each.asset}",
-                expected=f"{width} channels",
-                got=each.values.shape[-1],
-                remedy="give commands and then outputs, see Live.channels",
-            )
+            fits = each.values.ndim == 2 and each.values.shape[1] == width
+            expected = f"{width} channels"
+            got = each.values.shape[-1]
+            remedy = "give commands and then outputs, see Live.channels"
+            require(fits, f"samples of {each.asset}", expected=expected, got=got, remedy=remedy)
         found: list[Received] = []
         for whole_, group in groupby(batch, lambda each: self.in_trajectories(each.asset)):
             if whole_:

@@ -184,13 +184,10 @@ class OpcUa(Source):
             self._subscription = subscription
             results = await subscription.create_monitored_items(self._items(subscription))
             for node, result in zip(self._used, results, strict=True):
-                require(
-                    not isinstance(result, self._asyncua.ua.StatusCode),
-                    str(node),
-                    expected="a node of the server",
-                    got=str(result),
-                    remedy="correct its address in the source",
-                )
+                there = not isinstance(result, self._asyncua.ua.StatusCode)
+                expected = "a node of the server"
+                remedy = "correct its address in the source"
+                require(there, str(node), expected=expected, got=str(result), remedy=remedy)
             self._ready = True
             self.back()
             while not stop.is_set():

@@ -139,13 +139,11 @@ def _in_unit_of(
     name, own, unit = channel
     where = f"{place}, {own.signals[0]}"
     made, target, _ = in_unit(signal.values, own, signal.unit, unit, where)
-    require(
-        unit is not None or own.unit or same_unit(target, "1"),
-        where,
-        expected=f"the unit of {name}, of which the twin states none",
-        got=f"that of the table alone, {target}",
-        remedy=f"write unit = … for {name} in the mapping, the unit of its calibration data",
-    )
+    stated = unit is not None or own.unit or same_unit(target, "1")
+    expected = f"the unit of {name}, of which the twin states none"
+    got = f"that of the table alone, {target}"
+    remedy = f"write unit = … for {name} in the mapping, the unit of its calibration data"
+    require(stated, where, expected=expected, got=got, remedy=remedy)
     return made
 
 
@@ -388,11 +386,8 @@ def mapped_layout(
 
 def _same(found: list[Any], what: str, default: Any) -> Any:
     """What all records of a case have in common, or the default where there are none."""
-    require(
-        all(each == found[0] for each in found),
-        f"sources.{what}",
-        expected=f"the {what} of the files",
-        got="none, and records of the case that differ in it",
-        remedy=f"give `{what}` in the source",
-    )
+    agree = all(each == found[0] for each in found)
+    got = "none, and records of the case that differ in it"
+    remedy = f"give `{what}` in the source"
+    require(agree, f"sources.{what}", expected=f"the {what} of the files", got=got, remedy=remedy)
     return found[0] if found else default

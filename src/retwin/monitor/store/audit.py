@@ -142,13 +142,10 @@ def append(last: Entry | None, kind: str, data: Mapping[str, Any]) -> Entry:
         The kind is not in lower-case letters and underscores, or `canonical` raises it.
 
     """
-    require(
-        isinstance(kind, str) and KIND.fullmatch(kind),
-        "kind",
-        expected="at most 40 lower-case letters and underscores",
-        got=repr(kind)[:80],
-        remedy="name the kind of entry by a word",
-    )
+    fits = isinstance(kind, str) and KIND.fullmatch(kind)
+    expected = "at most 40 lower-case letters and underscores"
+    got = repr(kind)[:80]
+    require(fits, "kind", expected=expected, got=got, remedy="name the kind of entry by a word")
     sequence, previous = (0, START) if last is None else (last.sequence + 1, last.hash)
     entry = Entry(sequence, kind, canonical(data), previous, "")
     return Entry(sequence, kind, entry.text, previous, entry.digest())

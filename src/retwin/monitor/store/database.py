@@ -287,11 +287,8 @@ def _address(url: str) -> Any:
         address = sa.make_url(url)
     except sa.exc.ArgumentError:
         address = sa.URL.create("none")
-    require(
-        address.get_backend_name() in ("postgresql", "postgres"),
-        "url",
-        expected="a PostgreSQL database, postgresql://user@host/name",
-        got="another address",
-        remedy="correct it, or leave it out for SQLite in the folder",
-    )
+    postgresql = address.get_backend_name() in ("postgresql", "postgres")
+    expected = "a PostgreSQL database, postgresql://user@host/name"
+    remedy = "correct it, or leave it out for SQLite in the folder"
+    require(postgresql, "url", expected=expected, got="another address", remedy=remedy)
     return address.set(drivername="postgresql+psycopg")

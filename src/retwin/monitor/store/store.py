@@ -130,13 +130,10 @@ class Store:
 
         """
         name = instance("name", asset.name, str, remedy="give the asset's name as text")
-        require(
-            0 < len(name) <= 200 and name.isprintable(),
-            "name",
-            expected="from 1 to 200 printable characters",
-            got=repr(name[:80]),
-            remedy="rename the asset",
-        )
+        printable = 0 < len(name) <= 200 and name.isprintable()
+        expected = "from 1 to 200 printable characters"
+        got = repr(name[:80])
+        require(printable, "name", expected=expected, got=got, remedy="rename the asset")
         if asset.version is not None:
             whole("version", asset.version, at_most=2**31 - 1)
         row = {
@@ -149,13 +146,10 @@ class Store:
             if known is None:
                 connection.execute(assets.insert().values(name=name, **row))
             else:
-                require(
-                    known[1] == asset.channels,
-                    "channels",
-                    expected=f"{known[1]}, as the asset {name} has",
-                    got=asset.channels,
-                    remedy="add the machine under another name",
-                )
+                same = known[1] == asset.channels
+                expected = f"{known[1]}, as the asset {name} has"
+                remedy = "add the machine under another name"
+                require(same, "channels", expected=expected, got=asset.channels, remedy=remedy)
                 connection.execute(assets.update().where(assets.c.id == known[0]).values(row))
             self._assets = None
 

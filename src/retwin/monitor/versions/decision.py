@@ -120,13 +120,11 @@ def decide(
     from scipy.special import stdtrit
 
     old, new = (np.atleast_2d(np.asarray(each, dtype=float)) for each in (old_crps, new_crps))
-    require(
-        old.shape == new.shape and old.ndim == 2 and np.array_equal(np.isnan(old), np.isnan(new)),
-        "new_crps",
-        expected=f"CRPS of the same samples as old_crps, {old.shape}",
-        got=f"{new.shape}, or other samples",
-        remedy="score both versions on the same samples",
-    )
+    same = old.shape == new.shape and old.ndim == 2 and np.array_equal(np.isnan(old), np.isnan(new))
+    expected = f"CRPS of the same samples as old_crps, {old.shape}"
+    got = f"{new.shape}, or other samples"
+    remedy = "score both versions on the same samples"
+    require(same, "new_crps", expected=expected, got=got, remedy=remedy)
     present = np.isfinite(old) & np.isfinite(new)
     expected = "finite scores, NaN where a sample is missing"
     got = "infinite ones"

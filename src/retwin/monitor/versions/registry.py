@@ -231,13 +231,11 @@ class Registry:
         with self._store.lock:
             version = self._version(number)
             allowed = BEFORE[step] + (("proposed",) if first else ())
-            require(
-                version.state in allowed,
-                f"version {number}",
-                expected=f"one that is {' or '.join(allowed)}, to {step} it",
-                got=f"one that is {version.state}",
-                remedy="see versions()",
-            )
+            possible = version.state in allowed
+            expected = f"one that is {' or '.join(allowed)}, to {step} it"
+            got = f"one that is {version.state}"
+            remedy = "see versions()"
+            require(possible, f"version {number}", expected=expected, got=got, remedy=remedy)
             if AFTER[step] != "rejected":
                 self.folder(number)
             self._log(step, number, **more)
@@ -330,13 +328,11 @@ def _files(folder: Path) -> Iterator[Path]:
         if each.name.startswith("."):
             continue
         mode = each.lstat().st_mode
-        require(
-            stat.S_ISDIR(mode) or stat.S_ISREG(mode),
-            "folder",
-            expected="a folder of files, without links",
-            got=f"{each.name[:80]!r}, which is a link or a device",
-            remedy="save the model again into a new folder",
-        )
+        plain = stat.S_ISDIR(mode) or stat.S_ISREG(mode)
+        expected = "a folder of files, without links"
+        got = f"{each.name[:80]!r}, which is a link or a device"
+        remedy = "save the model again into a new folder"
+        require(plain, "folder", expected=expected, got=got, remedy=remedy)
         if stat.S_ISDIR(mode):
             yield from _files(each)
         else:

@@ -147,13 +147,11 @@ def check_records(observed: Trajectories) -> None:
     checked_stride(observed, observed, None, "observed")  # type: ignore[arg-type]  # its channels
     low, high = value_range(np.where(observed.mask, observed.observed, np.nan))
     fixed = [name for name, same in zip(observed.outputs.names, low == high, strict=True) if same]
-    require(
-        not fixed and len(observed.inputs) > 0,
-        "observed",
-        expected="commands, and outputs that are measured and that change",
-        got=f"outputs that do not: {', '.join(fixed)}" if fixed else "no commands",
-        remedy="leave such outputs out, and record the commands",
-    )
+    driven = not fixed and len(observed.inputs) > 0
+    expected = "commands, and outputs that are measured and that change"
+    got = f"outputs that do not: {', '.join(fixed)}" if fixed else "no commands"
+    remedy = "leave such outputs out, and record the commands"
+    require(driven, "observed", expected=expected, got=got, remedy=remedy)
 
 
 def best_order(

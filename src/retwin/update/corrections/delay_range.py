@@ -52,13 +52,10 @@ def range_in_samples(
     if delay_range is None:
         return plausible_delays(context, observed, mask)
     duration = context.segments.steps / context.rate
-    require(
-        np.abs(delay_range).max() <= duration,
-        "delay_range",
-        expected=f"delays in seconds, shorter than the trajectories of {duration:.3g} s",
-        got=delay_range,
-        remedy="divide samples by the sample rate, or leave it out to choose it from the outputs",
-    )
+    shorter = np.abs(delay_range).max() <= duration
+    expected = f"delays in seconds, shorter than the trajectories of {duration:.3g} s"
+    remedy = "divide samples by the sample rate, or leave it out to choose it from the outputs"
+    require(shorter, "delay_range", expected=expected, got=delay_range, remedy=remedy)
     # 0.3 s times 100 Hz is a little more than 30 samples.
     low, high = (each * context.rate for each in delay_range)
     return float(math.floor(low + ROUNDING)), float(math.ceil(high - ROUNDING))

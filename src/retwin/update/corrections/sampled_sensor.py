@@ -94,13 +94,10 @@ class SampledSensor:
         expected, remedy = "one whose timing is known", "call timed or fitted first"
         period = given("sensor", self.period, expected, got=repr(self), remedy=remedy)
         every = round(period * rate)
-        require(
-            every >= 1 and abs(period * rate - every) <= ROUNDING,
-            "sensor.period",
-            expected=f"a whole number of time steps of {1 / rate:g} s",
-            got=f"{period:g} s",
-            remedy="leave it out: it is fitted from data",
-        )
+        whole = every >= 1 and abs(period * rate - every) <= ROUNDING
+        expected = f"a whole number of time steps of {1 / rate:g} s"
+        remedy = "leave it out: it is fitted from data"
+        require(whole, "sensor.period", expected=expected, got=f"{period:g} s", remedy=remedy)
         if self.phases is None:
             return every, None
         return every, tuple(round(phase * rate) % every for phase in self.phases)

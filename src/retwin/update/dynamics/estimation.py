@@ -399,24 +399,20 @@ def estimate_starts(
         Not one trajectory, nothing measured, no unknown start, or a simulation that diverges.
 
     """
-    require(
-        len(record) == 1 and record.mask.any() and len(unknowns.free) > 0,
-        "record",
-        expected="one trajectory with measured samples, for a twin with unknown starts",
-        got=f"{len(record)} with {int(record.mask.sum())} samples, {len(unknowns.free)} starts",
-        remedy="give the first samples of one record; bounds make a start unknown",
-    )
+    fits = len(record) == 1 and record.mask.any() and len(unknowns.free) > 0
+    expected = "one trajectory with measured samples, for a twin with unknown starts"
+    got = f"{len(record)} with {int(record.mask.sum())} samples, {len(unknowns.free)} starts"
+    remedy = "give the first samples of one record; bounds make a start unknown"
+    require(fits, "record", expected=expected, got=got, remedy=remedy)
     given = np.ones(len(record.outputs)) if variance is None else variance
     own = Estimation(twin, record, unknowns, record.mask, given)
     found = own.linearised(Point(np.zeros(0), unknowns.start[None, unknowns.free]))
-    require(
-        bool(np.isfinite(found.products).all()),
-        "record",
-        expected="commands with which the simulation of the equations stays finite",
-        got=f"{record.ids[0]}, with which it diverges",
-        remedy="it leaves what the equations were corrected for: fit them to records like this "
-        "one, or take the twin with identified parameters alone",
-    )
+    finite = bool(np.isfinite(found.products).all())
+    expected = "commands with which the simulation of the equations stays finite"
+    got = f"{record.ids[0]}, with which it diverges"
+    remedy = "it leaves what the equations were corrected for: fit them to records like this "
+    remedy += "one, or take the twin with identified parameters alone"
+    require(finite, "record", expected=expected, got=got, remedy=remedy)
     for i in range(1 if variance is not None else ROUNDS):
         if variance is None:
             own = replace(own, variance=own.power(found.residual) if i else own.spread)

@@ -220,13 +220,10 @@ def identify(
         (Eq. 3).
 
     """
-    require(
-        isinstance(method, LeastSquares | Evolution | MCMC | NPE),
-        "method",
-        expected="LeastSquares(), Evolution(), MCMC() or NPE()",
-        got=repr(method),
-        remedy="give the settings of one of these methods",
-    )
+    known = isinstance(method, LeastSquares | Evolution | MCMC | NPE)
+    expected = "LeastSquares(), Evolution(), MCMC() or NPE()"
+    remedy = "give the settings of one of these methods"
+    require(known, "method", expected=expected, got=repr(method), remedy=remedy)
     began, missing = time.perf_counter(), ""
     if isinstance(method, LeastSquares | Evolution) and isinstance(observed, Trajectories):
         missing = unmeasured(observed)
@@ -324,13 +321,10 @@ def _samples_of(horizon: float | None, twin: ParametricTwin, observed: Trajector
     remedy += "known: write them as a StateTwin, or leave the horizon out"
     require(state_based(twin), "horizon", expected=expected, got=got, remedy=remedy)
     longest = observed.steps / observed.rate
-    require(
-        2 / observed.rate <= horizon <= longest,
-        "horizon",
-        expected=f"a time from {2 / observed.rate:g} to {longest:g} s, the longest record",
-        got=f"{horizon:g} s",
-        remedy="leave it out to have it chosen",
-    )
+    inside = 2 / observed.rate <= horizon <= longest
+    expected = f"a time from {2 / observed.rate:g} to {longest:g} s, the longest record"
+    got = f"{horizon:g} s"
+    require(inside, "horizon", expected=expected, got=got, remedy="leave it out to have it chosen")
     return round(horizon * observed.rate)
 
 

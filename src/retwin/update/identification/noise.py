@@ -47,13 +47,11 @@ class Noise:
     degrees: float | None = None
 
     def __post_init__(self) -> None:
-        require(
-            self.degrees is None or (self.degrees > 2 and not self.discrepancy),
-            "degrees",
-            expected="more than 2 degrees of freedom, or None; None with a discrepancy",
-            got=f"{self.degrees} with discrepancy={self.discrepancy}",
-            remedy="give discrepancy=False; 4 degrees are robust to outliers",
-        )
+        possible = self.degrees is None or (self.degrees > 2 and not self.discrepancy)
+        expected = "more than 2 degrees of freedom, or None; None with a discrepancy"
+        got = f"{self.degrees} with discrepancy={self.discrepancy}"
+        remedy = "give discrepancy=False; 4 degrees are robust to outliers"
+        require(possible, "degrees", expected=expected, got=got, remedy=remedy)
 
     @property
     def names(self) -> tuple[str, ...]:

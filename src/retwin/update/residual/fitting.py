@@ -202,13 +202,11 @@ def _segmented(
         rule, parts = segments, segment(used.commands, used.nominal, segments)
     else:
         rule, parts = "commands", segments
-    require(
-        parts.valid.any() or not needed,
-        "calibration",
-        expected="trajectories with segments of motion",
-        got="commands that never change",
-        remedy="give segments='path', or the segments themselves",
-    )
+    moving = parts.valid.any() or not needed
+    expected = "trajectories with segments of motion"
+    got = "commands that never change"
+    remedy = "give segments='path', or the segments themselves"
+    require(moving, "calibration", expected=expected, got=got, remedy=remedy)
     return rule, parts
 
 

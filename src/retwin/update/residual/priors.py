@@ -49,13 +49,10 @@ def other_machines(
     shown = []
     for each in models:
         model, name = _residual(each)
-        require(
-            type(before_sensor(model.correction)) is type(operator),
-            "prior",
-            expected="models with CommandSpace, as this one",
-            got=f"{type(before_sensor(model.correction)).__name__} in {name}",
-            remedy="leave it out",
-        )
+        alike = type(before_sensor(model.correction)) is type(operator)
+        expected = "models with CommandSpace, as this one"
+        got = f"{type(before_sensor(model.correction)).__name__} in {name}"
+        require(alike, "prior", expected=expected, got=got, remedy="leave it out")
         remedy = f"leave {name} out: it is no machine of this kind"
         agree("prior", model, twin, "those of the twin", names=("inputs", "outputs"), remedy=remedy)
         expected, got = "models that state what their machine has shown", f"none in {name}"

@@ -167,13 +167,10 @@ class Residual(nn.Module, ABC, Generic[D]):
         """Take the bounds b (d_z,) of a user, if any; InputError unless all are positive."""
         if bounds is None:
             return
-        require(
-            np.shape(bounds) == self.bounds.shape and (np.asarray(bounds) > 0).all(),
-            "bounds",
-            expected=f"one positive bound for each of {', '.join(self.latent.names)}",
-            got=repr(bounds),
-            remedy="leave bounds out to take them from the data",
-        )
+        fits = np.shape(bounds) == self.bounds.shape and (np.asarray(bounds) > 0).all()
+        expected = f"one positive bound for each of {', '.join(self.latent.names)}"
+        remedy = "leave bounds out to take them from the data"
+        require(fits, "bounds", expected=expected, got=repr(bounds), remedy=remedy)
         self.bounds.copy_(torch.as_tensor(bounds, dtype=torch.float32))
 
     @abstractmethod

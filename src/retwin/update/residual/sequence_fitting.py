@@ -64,13 +64,11 @@ def fit_sequence(task: ResidualTask, density: SequenceMixture) -> SequenceResidu
     data = _Records(past(task.context), found.z.float(), identified, torch.as_tensor(used.lengths))
     valid = torch.arange(used.steps) < data.lengths[:, None]
     held_out = held_out_parts(valid, density)
-    require(
-        (held_out & identified).flatten(1).any(dim=1).all(),
-        "calibration",
-        expected=f"measurements in each of {density.members} parts of the data",
-        got=f"{int(identified.sum())} measured samples, some parts with none",
-        remedy="give longer records, fewer members, or shorter blocks",
-    )
+    measured = (held_out & identified).flatten(1).any(dim=1).all()
+    expected = f"measurements in each of {density.members} parts of the data"
+    got = f"{int(identified.sum())} measured samples, some parts with none"
+    remedy = "give longer records, fewer members, or shorter blocks"
+    require(measured, "calibration", expected=expected, got=got, remedy=remedy)
     _prepare(model, data, task.bounds, seed)
     fitted = torch.stack([identified & ~_dilate(part, density.margin) for part in held_out])
     rounds = 1 + density.refit

@@ -66,13 +66,11 @@ class Library:
         whole("degree", self.degree, at_least=0)
         one_of("friction", self.friction, (True, False))
         one_of("sticking", self.sticking, (True, False))
-        require(
-            all(0 <= knot <= 1 for knot in self.knots),
-            "knots",
-            expected="places from 0 to 1, the end of the range in calibration",
-            got=", ".join(f"{knot:g}" for knot in self.knots),
-            remedy="a hinge outside that range is not determined by the data",
-        )
+        inside = all(0 <= knot <= 1 for knot in self.knots)
+        expected = "places from 0 to 1, the end of the range in calibration"
+        got = ", ".join(f"{knot:g}" for knot in self.knots)
+        remedy = "a hinge outside that range is not determined by the data"
+        require(inside, "knots", expected=expected, got=got, remedy=remedy)
 
     @property
     def linear(self) -> bool:
