@@ -82,18 +82,12 @@ def causal_part(
 
     """
     other = "export it as an FMU: retwin export fmu"
-    _refuse(
-        not isinstance(twin, CorrectedTwin),
-        f"{type(twin).__name__}, which has no correction that an actuator executes",
-        other,
-    )
+    got = f"{type(twin).__name__}, which has no correction that an actuator executes"
+    _refuse(not isinstance(twin, CorrectedTwin), got, other)
     assert isinstance(twin, CorrectedTwin)
     residual, operator = twin.residual, before_sensor(twin.residual.correction)
-    _refuse(
-        isinstance(operator, Chain),
-        "a Chain of operators: what stands behind the actuators is no actuator",
-        "fit one of CommandSpace and DelayOffset",
-    )
+    got = "a Chain of operators: what stands behind the actuators is no actuator"
+    _refuse(isinstance(operator, Chain), got, "fit one of CommandSpace and DelayOffset")
     _refuse(
         not isinstance(residual, ResidualModel)
         or type(operator) not in (CommandSpace, DelayOffset),
@@ -120,11 +114,9 @@ def _check_outputs(twin: CorrectedTwin) -> None:
         "not positions or torques of actuators",
         "fit CommandSpace, which finds what the actuators executed",
     )
-    _refuse(
-        not (isinstance(twin.surrogate, Surrogate) and twin.surrogate.memoryless),
-        "DelayOffset with a twin or a network that remembers, in place of an MLP",
-        "fit the surrogate with an MLP, or CommandSpace, or export it as an FMU",
-    )
+    got = "DelayOffset with a twin or a network that remembers, in place of an MLP"
+    remedy = "fit the surrogate with an MLP, or CommandSpace, or export it as an FMU"
+    _refuse(not (isinstance(twin.surrogate, Surrogate) and twin.surrogate.memoryless), got, remedy)
 
 
 def _refuse(wrong: bool, got: str, remedy: str) -> None:
@@ -167,11 +159,8 @@ def drawn(
         gain = torch.zeros_like(gain)  # its offsets change with time, not with the distance covered
     centre = target.mean(dim=0)
     early = float((z[:, 0] < 0).double().mean())
-    _refuse(
-        early > MAX_EARLY,
-        f"delays of which {early:.0%} are before the command",
-        "check the clocks of commands and outputs",
-    )
+    got = f"delays of which {early:.0%} are before the command"
+    _refuse(early > MAX_EARLY, got, "check the clocks of commands and outputs")
     missed = mean[segment, 1 + width :]
     return Draws(
         delay=z[:, :1].clamp_min(0) / twin.rate,

@@ -180,26 +180,19 @@ def _places(twin: Twin, joint: Joint) -> tuple[int, int, int, int | None]:
     torque = _place(twin.outputs, "torque", joint.torque)
     velocity = _place(twin.outputs, "velocity", joint.velocity) if joint.velocity else None
     commanded, reached = twin.inputs.units[target], twin.outputs.units[position]
-    _require(
-        commanded == reached,
-        "joints",
-        f"a position in the unit of its target, {commanded!r}",
-        repr(reached),
-        "convert one of them in the twin",
-    )
+    expected = f"a position in the unit of its target, {commanded!r}"
+    got = repr(reached)
+    _require(commanded == reached, "joints", expected, got, "convert one of them in the twin")
     return target, position, torque, velocity
 
 
 def _place(channels: Channels, role: str, name: str) -> int:
     """Where the channel is that has a role in a joint."""
-    _require(
-        name in channels.names,
-        "joints",
-        f"a {role} among {', '.join(channels.names)}",
-        f"{name!r}, which the twin has not",
-        "an actuator net needs torques of the machine; without them, export_actuator gives "
-        "effective position targets, which need none",
-    )
+    expected = f"a {role} among {', '.join(channels.names)}"
+    got = f"{name!r}, which the twin has not"
+    remedy = "an actuator net needs torques of the machine; without them, export_actuator gives "
+    remedy += "effective position targets, which need none"
+    _require(name in channels.names, "joints", expected, got, remedy)
     return channels.names.index(name)
 
 

@@ -49,10 +49,10 @@ class Chain:
     second: Correction | SampledSensor
 
     def __post_init__(self) -> None:
-        first = not isinstance(self.first, SampledSensor) and sensor_of(self.first) is None
+        acts = not isinstance(self.first, SampledSensor) and sensor_of(self.first) is None
         expected = "an operator that acts on the system, the sensor being last"
         got = type(self.first).__name__
-        require(first, "first", expected=expected, got=got, remedy="give the sensor as the second")
+        require(acts, "first", expected=expected, got=got, remedy="give the sensor as the second")
         if not isinstance(self.second, SampledSensor):
             alike = self.first.resolution == self.second.resolution
             expected = f"an operator with one z per {self.first.resolution}, as the first has"
