@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 from retwin import catalog
 from retwin.checks import existing, one_of, require
 from retwin.cli import options
-from retwin.cli.completion import complete_twins
-from retwin.cli.options import argument, option, rare
+from retwin.cli.options import argument, complete_twins, option, rare
 from retwin.cli.reading import log_reader, shown_records
 from retwin.cli.terminal import answer, bar, command_given, note, table
 from retwin.serialisation.places import check_place

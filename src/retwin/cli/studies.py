@@ -12,8 +12,16 @@ from rich.table import Table
 
 from retwin import catalog
 from retwin.checks import given
-from retwin.cli.completion import complete_sources
-from retwin.cli.options import CaseArgument, Json, LogMapping, Seed, argument, option, rare
+from retwin.cli.options import (
+    CaseArgument,
+    Json,
+    LogMapping,
+    Seed,
+    argument,
+    complete_sources,
+    option,
+    rare,
+)
 from retwin.cli.plans import Scheduler
 from retwin.cli.terminal import answer, bar, command_given, note, plain, resumable, table
 from retwin.progress import FinishedStage

@@ -24,7 +24,7 @@ from scipy.special import gammaln, softmax
 from torch import Tensor
 
 from retwin.inference.hyperprior import Hyperprior, Variances
-from retwin.inference.priors import ROUNDING, GaussianPrior, inverse
+from retwin.inference.problem import ROUNDING, GaussianPrior, inverse
 from retwin.inference.solver import Solution
 
 FREEDOM = 2.0

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.compiler import call, compiled_files
-from retwin.inference.losses import StudentT
-from retwin.inference.noise import Noise
-from retwin.inference.priors import GaussianPrior
-from retwin.inference.problem import Problem
+from retwin.inference.noise import Noise, StudentT
+from retwin.inference.problem import GaussianPrior, Problem
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -19,8 +19,7 @@ from torch import Tensor
 
 from retwin.inference.noise import Noise
 from retwin.inference.normal import compiled_objective, compiled_step
-from retwin.inference.priors import GaussianPrior, inverse
-from retwin.inference.problem import Problem, Rows
+from retwin.inference.problem import GaussianPrior, Problem, Rows, inverse
 
 MAX_STEPS = 25
 """Gauss-Newton steps at most."""

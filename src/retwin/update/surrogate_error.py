@@ -15,7 +15,7 @@ from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Context
-from retwin.update.corrections.warp import within
+from retwin.update.corrections.delays import within
 from retwin.update.surrogate import Surrogate, known_samples
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Chain, CommandSpace, Context, DelayOffset, before_sensor
-from retwin.update.corrections.warp import gather_samples
+from retwin.update.corrections.delays import gather_samples
 from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
 

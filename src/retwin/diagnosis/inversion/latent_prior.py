@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from retwin.errors import InputError
-from retwin.inference.priors import GaussianPrior
+from retwin.inference.problem import GaussianPrior
 from retwin.nets.mixtures import Bernoullis, GaussianMixture
 from retwin.nets.student import Student
 from retwin.update.corrections import CommandSpace, Context, Correction, before_sensor

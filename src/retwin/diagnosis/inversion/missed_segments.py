@@ -12,8 +12,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from retwin.inference.losses import StudentT
-from retwin.inference.noise import Noise, predicted_variance
+from retwin.inference.noise import Noise, StudentT, predicted_variance
 from retwin.update.corrections.commands.missed_segments import (
     MARGIN,
     SEARCHES,

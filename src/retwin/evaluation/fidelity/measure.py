@@ -15,7 +15,7 @@ from retwin.checks import require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import PER_SAMPLE, Channels, Trajectories
 from retwin.evaluation.fidelity.figures import BINS, Fidelity
-from retwin.evaluation.fidelity.latents import shown_latents
+from retwin.evaluation.fidelity.overlay import shown_latents
 from retwin.progress import Progress, tracked
 from retwin.scores.distributions import (
     LEVELS,

@@ -19,8 +19,8 @@ from retwin.update.corrections.correction import (
     Head,
     block_diagonal,
 )
+from retwin.update.corrections.delays import gather_samples
 from retwin.update.corrections.sampled_sensor import SampledSensor
-from retwin.update.corrections.warp import gather_samples
 
 
 @dataclass(frozen=True)

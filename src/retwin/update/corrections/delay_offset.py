@@ -15,15 +15,13 @@ from torch import Tensor
 
 from retwin.checks import positive
 from retwin.data.trajectories import Channels
-from retwin.inference.losses import StudentT
-from retwin.inference.noise import Noise
-from retwin.inference.priors import GaussianPrior
+from retwin.inference.noise import Noise, StudentT
+from retwin.inference.problem import GaussianPrior
 from retwin.inference.solver import Solution, blocks, solve
 from retwin.update.corrections.commands.path_problem import PathProblem, path_at
 from retwin.update.corrections.correction import Context, Discrepancy, Head
 from retwin.update.corrections.delay_range import checked_range, range_in_samples, range_in_seconds
-from retwin.update.corrections.delays import at_bound, first_delays
-from retwin.update.corrections.warp import within
+from retwin.update.corrections.delays import at_bound, first_delays, within
 from retwin.update.kernels.generation import delayed_path
 
 ROUNDS = 5

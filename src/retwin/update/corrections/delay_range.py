@@ -16,8 +16,7 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.update.corrections.commands.path_problem import PathProblem
 from retwin.update.corrections.correction import Context
-from retwin.update.corrections.delays import common_delay, first_delays
-from retwin.update.corrections.warp import within
+from retwin.update.corrections.delays import common_delay, first_delays, within
 
 ROUNDING = 1e-6
 """Difference in samples that is only the rounding of numbers."""

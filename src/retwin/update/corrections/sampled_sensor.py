@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from retwin.checks import given, require
 from retwin.data.segments import Segments
-from retwin.update.corrections.warp import gather_samples
+from retwin.update.corrections.delays import gather_samples
 from retwin.update.kernels.generation import joined_samples
 
 LONGEST_PERIOD = 1000

@@ -14,8 +14,7 @@ from retwin.update.identification.mcmc import MCMC
 from retwin.update.identification.misfit import Misfit, misfit_of
 from retwin.update.identification.npe import NPE
 from retwin.update.identification.posterior import Posterior, PosteriorTwin
-from retwin.update.identification.problem import BoxProblem
-from retwin.update.identification.summaries import Summaries, outlyingness
+from retwin.update.identification.problem import BoxProblem, Summaries, outlyingness
 
 MAX_DRAWS = 4000
 """Largest number of draws of the posterior that are kept."""

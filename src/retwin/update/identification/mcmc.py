@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import needs_extra, whole
 from retwin.progress import Progress, tracked
-from retwin.update.identification.noise import Noise
-from retwin.update.identification.problem import BoxProblem
+from retwin.update.identification.problem import BoxProblem, Noise
 from retwin.update.identification.search import LeastSquares, Search
 
 INITIAL_DEVIATION = 0.02

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import finite, needs_extra, positive, whole
 from retwin.progress import Progress, tracked
-from retwin.update.identification.noise import Noise
-from retwin.update.identification.problem import BoxProblem
-from retwin.update.identification.summaries import Summaries
+from retwin.update.identification.problem import BoxProblem, Noise, Summaries
 
 OVERSAMPLING = 4
 """Draws per sample of the posterior, since those outside the prior's box are rejected."""

@@ -22,7 +22,7 @@ from retwin.twins.wrappers.noisy import sensor_sample_count
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.twins.wrappers.randomised import simulate_with_parameters
 from retwin.twins.wrappers.wrapper import TwinWrapper, chunk_generator
-from retwin.update.identification.noise import Noise
+from retwin.update.identification.problem import Noise
 
 KIND = "posterior"
 """Kind of the saved model."""

@@ -10,12 +10,10 @@ import torch
 from torch import Tensor
 
 from retwin.data.segments import Segments
-from retwin.inference.losses import Tukey
-from retwin.inference.noise import Noise, common_rounding, correlation_time
+from retwin.inference.noise import Noise, Tukey, common_rounding, correlation_time
 from retwin.inference.solver import Bounds
-from retwin.update.corrections.delays import DelayProblem, delay_bounds
+from retwin.update.corrections.delays import DelayProblem, Knots, delay_bounds, interpolate, within
 from retwin.update.corrections.sampled_sensor import lattice_step
-from retwin.update.corrections.warp import Knots, interpolate, within
 
 MAX_STEP = 1 / 7
 """Largest change of a delay in one step, in widths of its range: the path is only piecewise smooth

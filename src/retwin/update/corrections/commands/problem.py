@@ -17,10 +17,16 @@ from retwin.update.corrections.commands.effective_commands import (
     effective_commands,
 )
 from retwin.update.corrections.correction import Context, DifferentiableTwin
-from retwin.update.corrections.delays import DelayProblem, delay_bounds
+from retwin.update.corrections.delays import (
+    DelayProblem,
+    delay_bounds,
+    gather_samples,
+    interpolate,
+    thinned,
+    within,
+)
 from retwin.update.corrections.sampled_sensor import lattice_step
 from retwin.update.corrections.surrogate_slopes import differences, outputs_at, slopes_at
-from retwin.update.corrections.warp import gather_samples, interpolate, thinned, within
 from retwin.update.kernels.generation import linearised_outputs
 
 SURROGATE_STEP = 0.05
