@@ -18,14 +18,10 @@ from scipy.special import expit
 DECAYS = np.array([0.5, 0.9, 0.98])
 """Factors per sample by which a change of a command is forgotten: within two, ten and fifty
 samples. A sum of them describes what lasts for any time between."""
-NARROWEST = 1e-3
-"""Width of the interval of an error that is not rounded, in its standard deviations."""
 LARGEST = 4.0
 """Errors count up to this for the scale of a record, so that no fault is taken for it."""
 DEGREES = (4.0, 1e4)
 """Limits of the degrees of freedom of a record's variance."""
-FARTHEST = 8.0
-"""Errors count up to this, so that single outliers do not decide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +133,9 @@ def fit_noise(
     given: NDArray,
     sizes: tuple[int, ...],
     folds: Sequence[NDArray],
+    *,
+    narrowest: float = 1e-3,
+    farthest: float = 8.0,
 ) -> tuple[Noise, NDArray, NDArray]:
     """The noise of errors (S, T), with means and scales (S, T) of folds that were left out.
 
@@ -150,6 +149,10 @@ def fit_noise(
         Numbers of features of each kind: commands, changes, levels.
     folds : sequence of NDArray
         Samples that are left out in turn.
+    narrowest : float, default 1e-3
+        Width of the interval of an error that is not rounded, in its standard deviations.
+    farthest : float, default 8.0
+        Errors count up to this, so that single outliers do not decide.
 
     """
     seen = np.isfinite(errors).any(axis=0)
@@ -163,7 +166,7 @@ def fit_noise(
     apart = np.zeros((2, *errors.shape))
     for i, (error, wide) in enumerate(zip(errors, width, strict=True)):
         own = np.flatnonzero(np.isfinite(error))
-        ends = np.clip(error, -FARTHEST, FARTHEST), np.maximum(np.nan_to_num(wide), NARROWEST)
+        ends = np.clip(error, -farthest, farthest), np.maximum(np.nan_to_num(wide), narrowest)
         best = -np.inf
         for chosen in candidates:
             used = np.append(chosen, True)

@@ -31,16 +31,12 @@ TRAJECTORIES_PER_BATCH = 128
 WIDE = 100.0
 """Standard deviation of the prior, in the largest plausible value: it decides only what was not
 measured at all."""
-UNSEEN = 0.1
-"""Share of the prior's standard deviation above which an offset was not measured."""
 KNOWN_DELAY = 1 / 8
 """Standard deviation above which a delay is not identified by default, in widths of its range: less
 than half of that of a delay of which nothing is known."""
 SIGNIFICANT = 3.0
 """Way of a motion, in standard deviations of the step between its offsets, below which noise could
 have made it: its delay is then not identified."""
-MEASURED_MOTION = 0.5
-"""Share of a motion that must be measured for its delay to be identified."""
 
 
 @dataclass(frozen=True)
@@ -175,8 +171,20 @@ def _discrepancy(
     prior: GaussianPrior,
     unit: Tensor,
     known_delay: float,
+    *,
+    unseen: float = 0.1,
+    measured_motion: float = 0.5,
 ) -> Discrepancy:
-    """z, each segment's covariance, and which components the outputs identify."""
+    """z, each segment's covariance, and which components the outputs identify.
+
+    Parameters
+    ----------
+    unseen : float, default 0.1
+        Share of the prior's standard deviation above which an offset was not measured.
+    measured_motion : float, default 0.5
+        Share of a motion that must be measured for its delay to be identified.
+
+    """
     z = problem.per_segment(solution.x)
     covariance = blocks(solution.covariance, z.shape[1])
     deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
@@ -184,8 +192,8 @@ def _discrepancy(
     valid = torch.as_tensor(problem.segments.valid)
     bounded = at_bound(z[..., 0], problem.delay_range) & valid
     delay = (deviation[..., 0] <= known_delay) & _moves(problem, z, deviation) & ~bounded
-    delay &= problem.motion_measured >= MEASURED_MOTION
-    offset = deviation[..., 1:] <= UNSEEN * wide[..., 1:]
+    delay &= problem.motion_measured >= measured_motion
+    offset = deviation[..., 1:] <= unseen * wide[..., 1:]
     identified = torch.cat([delay[..., None], offset], dim=-1)
     identified = identified & valid[..., None]
     scale = torch.cat([unit.new_ones(1), unit])

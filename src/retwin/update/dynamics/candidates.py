@@ -28,16 +28,12 @@ __all__ = ["Candidate", "best_of", "better", "searched", "without_discrepancy"]
 STEP = (2.0, 3.0)
 """Least and largest ratio of that variance to the next one: larger steps leave the optimum that the
 search follows."""
-CONSISTENT = 0.9
-"""Ratio of the observed to the assumed variance from which they agree."""
 HELD = 1e-3
 """Standard deviation of what the outputs of the twin alone do not determine, in those of the
 parameters if each were the only one: a discrepancy would determine it by its prior alone."""
 OPEN, MAX_OPEN = 2, 100
 """Degree of the monomials of all states and commands in each equation, and number of coefficients
 above which they are not tried."""
-MAX_STRENGTHS = 30
-"""Number of variances at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,6 +313,9 @@ def _follow(
     alone: Estimation,
     point: Point,
     strength: float,
+    *,
+    consistent: float = 0.9,
+    max_strengths: int = 30,
 ) -> tuple[Estimation, Linearised]:
     """The fit whose assumed errors are those that are observed.
 
@@ -333,6 +332,10 @@ def _follow(
         Where the search begins; coefficients that it does not have are at their starts.
     strength : float
         The first assumed variance, over that of `alone`.
+    consistent : float, default 0.9
+        Ratio of the observed to the assumed variance from which they agree.
+    max_strengths : int, default 30
+        Number of variances at most.
 
     """
     estimation = _with_discrepancy(equations, [memory] if memory else [], alone)
@@ -340,7 +343,7 @@ def _follow(
     begun = np.append(point.shared, estimation.unknowns.mean[len(point.shared) :])
     now = estimation.linearised(Point(begun, point.starts))
     states = len(equations.twin.states)
-    for _ in range(MAX_STRENGTHS):
+    for _ in range(max_strengths):
         estimation = replace(estimation, variance=strength * power)
         now = estimation.minimised(now)
         # What a network has in common with parameters is that over the states that it leads to.
@@ -350,7 +353,7 @@ def _follow(
         estimation = replace(estimation, absorbed=absorbed)
         ratio = np.mean(estimation.power(now.residual) / power)
         observed = correlation_time(now.residual) * float(ratio)
-        if observed >= CONSISTENT * strength:
+        if observed >= consistent * strength:
             break
         strength = float(np.clip(observed, strength / STEP[1], strength / STEP[0]))
     # The last step may have led below what is observed.
