@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from retwin.deploy.actuator.export import ExportedActuator
     from retwin.deploy.actuator.torque_net import Joint
 
-TRAJECTORIES = 256
-"""Trajectories of the case's sampler at whose segments z is drawn, or whose torques are learned."""
 
 app = Commands(
     help="Take an updated twin to other tools.",
@@ -225,4 +223,5 @@ def _sampled(twin: Any, model: Path, case: str | None, seed: int) -> NDArray:
     import numpy as np
 
     sampler = system_of(twin, model, case).sampler
-    return sampler.sample(TRAJECTORIES, rng=np.random.default_rng(seed))
+    # Trajectories of the case's sampler at whose segments z is drawn, or whose torques are learned.
+    return sampler.sample(256, rng=np.random.default_rng(seed))

@@ -37,9 +37,6 @@ TOLERANCE = 1e-3
 """Relative change of all variances below which they have converged."""
 LARGEST = 1e3
 """Largest standard deviation, in units: what outputs hardly show is linear no further."""
-JITTER = 1e-13
-"""Added to the diagonal, relative to its largest element, where rounding makes a curvature
-indefinite."""
 WARM_UP, DRAWS = 20, 100
 """Draws of the variances that are left out first, and that are then averaged over."""
 FLAT, CONDITION = 0, -1
@@ -308,7 +305,9 @@ class Hierarchy:
         curvature = (curvature + curvature.mT) / 2 + identity
         factor, failed = torch.linalg.cholesky_ex(curvature)
         if failed.any():
-            rounding = JITTER * curvature.diagonal(dim1=1, dim2=2).amax(dim=1) * (failed > 0)
+            # Added to the diagonal, relative to its largest element, where rounding makes a
+            # curvature indefinite.
+            rounding = 1e-13 * curvature.diagonal(dim1=1, dim2=2).amax(dim=1) * (failed > 0)
             factor = torch.linalg.cholesky(curvature + rounding[:, None, None] * identity)
         covariance = torch.cholesky_inverse(factor) * scale
         weighted = features * precision[..., None]

@@ -26,8 +26,6 @@ UNEXPLAINED = 0.1
 """Share of the variance that a twin leaves, below which commands are in their places."""
 DIVERGED = 1e100
 """Size of outputs that no simulation has which does not diverge, and whose square is finite."""
-PAIRS = 15
-"""Pairs of commands that are tried, at most."""
 
 
 def check_with_twin(twin: Twin | None, records: Trajectories) -> Checked:
@@ -85,7 +83,8 @@ def _find_exchanged(twin: Twin, records: Trajectories, *, clear: float = 0.5) ->
     here, names = _unexplained_share(healthy), records.inputs.names
     if here < UNEXPLAINED:
         return
-    for a, b in list(combinations(range(len(names)), 2))[:PAIRS]:
+    # Pairs of commands that are tried, at most.
+    for a, b in list(combinations(range(len(names)), 2))[:15]:
         order = np.arange(len(names))
         order[[a, b]] = order[[b, a]]
         other = healthy.replace(commands=healthy.commands[..., order])

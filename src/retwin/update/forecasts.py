@@ -33,8 +33,6 @@ from retwin.update.forecast_errors import (
 
 DRAWS = 100
 """Simulations of a trajectory whose mean and deviation stand for a distribution."""
-ORIGINS = 2000
-"""Samples from which predictions start, at most, of all trajectories together."""
 LEADS = (1, 3, 10, 30, 100)
 """Samples ahead at which errors are calibrated."""
 BEGIN = 10
@@ -165,7 +163,8 @@ def _from_states(twin: DynamicsTwin, record: Trajectories, leads: Sequence[int])
     states = twin.filter(commands, *rest)[2]
     count, steps = commands.shape[:2]
     longest = min(max(leads), steps - 1)
-    stride = max(1, count * steps // ORIGINS)
+    # Samples from which predictions start, at most, of all trajectories together.
+    stride = max(1, count * steps // 2000)
     row, origin = (each.ravel() for each in np.mgrid[:count, 0 : steps - 1 : stride])
     # Earlier commands, on which a spline between samples and dead times depend.
     delays = [twin.values[place] for _, place in twin.equations.delay_places]

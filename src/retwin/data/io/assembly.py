@@ -15,9 +15,6 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-RATE_TOLERANCE = 1e-3
-"""Relative difference of sample rates that count as equal: files round their times."""
-
 
 class DataCase(Protocol):
     """Channels, sample rate and classes of the data of one system."""
@@ -273,4 +270,5 @@ def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None)
 
 
 def _close(rate: float, other: float) -> bool:
-    return bool(np.isclose(rate, other, rtol=RATE_TOLERANCE, atol=0))
+    # Relative difference of sample rates that count as equal: files round their times.
+    return bool(np.isclose(rate, other, rtol=1e-3, atol=0))

@@ -28,9 +28,6 @@ from retwin.serialisation.places import check_place
 from retwin.twins.twin import Twin, checked_commands, checked_seed
 from retwin.update.surrogate import fit_surrogate
 
-MAX_HISTORY = 1000
-"""Steps into the past at most."""
-
 
 @dataclass(frozen=True)
 class Joint:
@@ -167,7 +164,8 @@ def _require(right: bool, what: str, expected: str, got: str, remedy: str) -> No
 
 
 def _history(history: Sequence[int]) -> tuple[int, ...]:
-    lags = tuple(int(finite("history", each, at_least=0, at_most=MAX_HISTORY)) for each in history)
+    # Steps into the past at most.
+    lags = tuple(int(finite("history", each, at_least=0, at_most=1000)) for each in history)
     right = bool(lags) and len(set(lags)) == len(lags) and lags == tuple(history)
     _require(right, "history", "steps into the past, each once", str(history), "give (0, 1, 2)")
     return lags

@@ -27,10 +27,6 @@ CHECKS = (
 """Names of the checks, in the order of their scores; the last checks the diagnoser's output."""
 COMMANDS, OUTPUTS = ("low", "high", "speed"), ("floor", "ceiling", "spread")
 """Fields of `Domain` that have one number per command, and per output."""
-MISSING_LIMIT = 0.25
-"""Limit of the share of missing measurements."""
-LENGTH_LIMIT = 2.0
-"""Limit of the ratio between a trajectory's length and that of the bundle's, or its inverse."""
 OUTSIDE = 10.0
 """Score, in multiples of a check's limit, above which a trajectory is outside."""
 
@@ -280,13 +276,15 @@ class Domain:
         # The limit of nominal outputs is their mismatch. Excluded here is only what would overflow:
         # more than a whole range beyond the range of the observed outputs.
         far = _excess(trajectories.nominal, self.floor, self.ceiling) > 1 / TOLERANCE
+        # Limit of the share of missing measurements.
+        # Limit of the ratio between a trajectory's length and that of the bundle's, or its inverse.
         return {
             "commands": _excess(trajectories.commands, self.low, self.high),
             "speed": _excess(speed[:, None], np.zeros(len(self.speed)), self.speed),
             "outputs": _excess(trajectories.observed, self.floor, self.ceiling, trajectories.mask),
             "nominal": np.where(far, np.inf, 0.0),
-            "missing": np.where(measured > 0, (1 - measured) / MISSING_LIMIT, np.inf),
-            "length": np.full(len(trajectories), ratio / LENGTH_LIMIT),
+            "missing": np.where(measured > 0, (1 - measured) / 0.25, np.inf),
+            "length": np.full(len(trajectories), ratio / 2.0),
         }
 
 

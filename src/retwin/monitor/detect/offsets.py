@@ -30,8 +30,6 @@ MAX_LOG_RATIO = np.log(5.0)
 be an outlier, of which the calibration has too few to know how often they come."""
 FARTHEST = 1e6
 """Standard deviations up to which offsets are distinguished, so that squares stay finite."""
-SMALLEST = 0.1
-"""Smallest size that is tried, in standard deviations: of less there is no evidence."""
 DEGREES = (2.5, 100.0)
 """Degrees of freedom of Student's distribution that are tried: below 2 it has no variance, and
 above 100 it is a normal one."""
@@ -95,7 +93,8 @@ class OffsetModel:
         error = (np.nan_to_num(offsets, nan=self.mean[own]) - self.mean[own]) / scale
         error = np.clip(error, -FARTHEST, FARTHEST)
         healthy = np.max([_log_density(error, each) for each in self.degrees], axis=0)
-        low, high = (max(each / scale, SMALLEST) for each in fault.size)
+        # Smallest size that is tried, in standard deviations: of less there is no evidence.
+        low, high = (max(each / scale, 0.1) for each in fault.size)
         made = []
         for share in SIZES:
             size = low ** (1 - share) * high**share

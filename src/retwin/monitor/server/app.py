@@ -30,8 +30,6 @@ from retwin.monitor.versions.comparison import Comparisons
 from retwin.monitor.versions.registry import Registry
 from retwin.report.figures.style import CHROME, PALETTE
 
-LISTENERS = 100
-"""Pages that may listen to events at the same time."""
 PAUSE, HEARTBEAT = 0.25, 15.0
 """Seconds between two events at least, and at most."""
 TEXT = "charset=utf-8"
@@ -186,7 +184,8 @@ def _add_reading(app: fastapi.FastAPI, live: Live, views: Views, metrics: Metric
     async def events(request: fastapi.Request) -> Any:
         """Server-sent events: one with the revision whenever something has changed."""
         remedy = "close pages that are not needed"
-        at_most("events", len(listeners) + 1, LISTENERS, "listeners", remedy=remedy)
+        # Pages that may listen to events at the same time.
+        at_most("events", len(listeners) + 1, 100, "listeners", remedy=remedy)
         return fastapi.responses.StreamingResponse(
             _revisions(live, listeners, request.app.state.closing), media_type="text/event-stream"
         )

@@ -93,12 +93,8 @@ class Assembly:
 
 TIMEOUT = 4.0
 """Seconds in which the server must answer."""
-LONGEST = 1.0
-"""Seconds between two publications, at most."""
 FILES = "give the files that the server's administrator made"
 """What to do where one cannot be used."""
-MARGIN = 1.5
-"""Intervals of publication for which a sample waits for channels that may not have changed."""
 
 
 class OpcUa(Source):
@@ -144,7 +140,8 @@ class OpcUa(Source):
             existing(f"sources.{name}", file, there, "a file", remedy=FILES)
         self._password = secret("password of the server", settings.password_env)
         shortest = min(1 / rates[asset] for asset in settings.nodes)
-        self._interval = settings.interval or min(shortest / 2, LONGEST)
+        # Seconds between two publications, at most.
+        self._interval = settings.interval or min(shortest / 2, 1.0)
         self._used: dict[Any, list[tuple[str, int]]] = {}
         """By node, the machines that it belongs to, with the number of the channel."""
         self._assemblies: dict[str, Assembly] = {}
@@ -158,7 +155,9 @@ class OpcUa(Source):
             for name, text in nodes.items():
                 place = (asset, list(channels[asset]).index(name))
                 self._used.setdefault(self._node(text), []).append(place)
-            period, settle = 1 / rates[asset], MARGIN * self._interval
+            # Intervals of publication for which a sample waits for channels that may not have
+            # changed.
+            period, settle = 1 / rates[asset], 1.5 * self._interval
             self._assemblies[asset] = Assembly(len(nodes), period, settle)
 
     def run(self, gate: Gate, stop: threading.Event) -> None:

@@ -32,8 +32,6 @@ from retwin.scores.distributions import crps_normal
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 
-MAX_SAMPLES = 20_000
-"""Newest samples of each asset that are compared, which bounds time and memory."""
 MIN_TRAJECTORIES, MAX_TRAJECTORIES = 2 * BLOCKS, 6 * BLOCKS
 """Healthy trajectories of all assets together that are compared: at least, so that a block of the
 bootstrap has two, and at most, since diagnosing each may take seconds."""
@@ -169,7 +167,8 @@ def _healthy_samples(store: Store, twin: str, monitor: Monitor) -> Iterator[NDAr
     alarms = collect_times(store, "time", "alarm", "remark", "end")
     period = SECOND / monitor.twin.rate
     for name, newest, _ in _machines(store, twin):
-        first = newest - round(MAX_SAMPLES * period)
+        # Newest samples of each asset that are compared, which bounds time and memory.
+        first = newest - round(20_000 * period)
         times, rows = gridded(store, name, monitor.twin, first, newest)
         ends = np.searchsorted(times, sorted(alarms.get(name, [])))
         ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))

@@ -37,10 +37,6 @@ PATIENCE = 2
 STRONGEST = 1000.0
 """Variance of the error of an effective sample that is assumed first, over that of the model where
 it begins: a prior so strong that nonlinear terms begin near 0."""
-STEP = 10.0
-"""Ratio of that variance to the next one."""
-MAX_STRENGTHS = 8
-"""Number of variances at most."""
 SAME = 0.1
 """Logarithm of the ratio of two variances below which they agree."""
 
@@ -272,7 +268,8 @@ def with_best_prior(start: Callable[[NDArray], BlackBoxFit], seen: NDArray) -> B
         return None
     variance = STRONGEST * observed_variance(fits[0].estimation, fits[0].point)
     best, least, since = fits[0], np.inf, 0
-    for _ in range(MAX_STRENGTHS):
+    # Number of variances at most.
+    for _ in range(8):
         fits = [each.searched(variance) for each in fits]
         found = replace(whole, errors=held_out_errors(fits, parts, seen))
         since += 1
@@ -280,7 +277,8 @@ def with_best_prior(start: Callable[[NDArray], BlackBoxFit], seen: NDArray) -> B
             whole, best, least, since = found, fits[0], found.held_out, 0
         if since == PATIENCE:
             break
-        variance = variance / STEP
+        # Ratio of that variance to the next one.
+        variance = variance / 10.0
     whole = replace(whole, point=best.point).searched(best.estimation.variance)
     observed = observed_variance(whole.estimation, whole.point)
     return replace(whole, estimation=replace(whole.estimation, variance=observed))

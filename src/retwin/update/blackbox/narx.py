@@ -28,10 +28,6 @@ from retwin.update.blackbox.lags import ROWS_PER_TERM, Lags, least_squares
 from retwin.update.dynamics.estimation import Estimation, Point
 from retwin.update.dynamics.unknowns import coefficients_of
 
-DEGREE = 3
-"""Highest degree of the monomials; it is lowered for many variables, see `Library`."""
-MAX_ORDER = 4
-"""Largest number of past samples that is tried."""
 WIDER = 4.0
 """Bound of outputs, in half widths of their range in calibration about its centre: a simulation
 that diverges is held there, and the model warns that it leaves the range."""
@@ -51,9 +47,11 @@ def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> es
     each explains beyond those before it. They have a Gaussian prior about 0.
     """
     estimate.check_records(observed)
-    orders = range(1, MAX_ORDER + 1)
+    # Largest number of past samples that is tried.
+    orders = range(1, 5)
+    # Highest degree of the monomials; it is lowered for many variables, see `Library`.
     order, found = estimate.best_order(
-        orders, lambda n: Polynomial(Lags(observed, n, DEGREE)).fit(), progress
+        orders, lambda n: Polynomial(Lags(observed, n, 3)).fit(), progress
     )
     return found.model(order, len(observed.outputs))
 

@@ -20,9 +20,6 @@ from retwin.data.segments import Segments
 from retwin.update.corrections.delays import gather_samples
 from retwin.update.kernels.generation import joined_samples
 
-LONGEST_PERIOD = 1000
-"""Longest sampling period that is searched for, in time steps of the record: it bounds the time
-that the search takes. Other limits are shares of the record."""
 ROUNDING = 1e-6
 """Difference from a whole number of time steps that is only the rounding of numbers."""
 REGULAR, GROSS = 0.9, 30.0
@@ -231,7 +228,9 @@ def _timing(observed: Tensor, mask: Tensor, *, min_values: int = 20) -> tuple[in
     """
     measured = int(mask.any(dim=-1).any(dim=0).sum())
     bends = _bends(observed, mask)
-    for every in range(min(LONGEST_PERIOD, measured // min_values), 1, -1):
+    # Longest sampling period that is searched for, in time steps of the record: it bounds the time
+    # that the search takes. Other limits are shares of the record.
+    for every in range(min(1000, measured // min_values), 1, -1):
         kinks = _kinks(bends, every)
         plain = _plain(kinks)
         if 2 * plain.sum() > (kinks.amax(dim=1) > 0).sum():

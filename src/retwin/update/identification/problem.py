@@ -237,8 +237,6 @@ def outlyingness(measured: NDArray, simulated: NDArray) -> float:
     return float((1 + np.sum(distance[1:] >= distance[0])) / len(distance))
 
 
-PRIOR_DRAWS = 200
-"""Draws from the prior whose simulations the measured data are compared with."""
 NOISES = 32
 """Draws of the noise, each with its own scales, that are added to a simulated path."""
 
@@ -316,7 +314,8 @@ class BoxProblem:
     @cached_property
     def prior(self) -> tuple[NDArray, NDArray]:
         """Points from the prior whose simulation succeeds, and their `paths`; computed once."""
-        points = np.random.default_rng(self.seed).random((PRIOR_DRAWS, self.size))
+        # Draws from the prior whose simulations the measured data are compared with.
+        points = np.random.default_rng(self.seed).random((200, self.size))
         paths = self.paths(points)
         good = np.isfinite(paths).all(axis=(1, 2, 3))
         return points[good], paths[good]

@@ -26,8 +26,6 @@ from retwin.update.residual.targets import ResidualTask
 
 SPREADS = np.geomspace(0.5, 4.0, 85)
 """Candidates for the factor of the standard deviations, 2.5 % from one to the next."""
-QUANTILE90 = 1.6449
-"""Absolute value that a standard normal variable exceeds with probability 0.1."""
 MAX_PERSISTENCE = 0.999
 """Largest persistence; beyond it the correlation time exceeds the length of common records."""
 
@@ -222,11 +220,12 @@ def _calibrate(model: SequenceResidual, data: _Records, held_out: Tensor) -> dic
     scores = distribution.normal_scores(data.z.expand_as(means))
     if model.density.persistent:
         model.persistence.copy_(_persistence(scores, held_out))
+    # Absolute value that a standard normal variable exceeds with probability 0.1.
     figures = {
         "samples": float(held_out.sum()),
         "nll": -log_likelihood(spread) / int(held_out.sum()),
         "spread": spread,
-        "coverage90": float((scores[held_out].abs() < QUANTILE90).float().mean()),
+        "coverage90": float((scores[held_out].abs() < 1.6449).float().mean()),
     }
     error = distribution.mean[held_out] - z
     by_name = {

@@ -34,8 +34,6 @@ from retwin.twins.twin import Twin
 from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.dynamics.unknowns import coefficients_of
 
-PAST = 10
-"""Least number of past samples from which the first estimate of the states is made."""
 DISTINCT = 1e-10
 """Singular values, over the largest one, below which columns are combinations of others."""
 
@@ -220,7 +218,8 @@ def _linear(v: NDArray, y: NDArray, order: int, *, stable: float = 0.999) -> Lin
         Largest modulus of an eigenvalue of the linear part where it begins.
 
     """
-    lags = min(max(PAST, 2 * order), (v.shape[1] - 1) // 3)
+    # Least number of past samples from which the first estimate of the states is made.
+    lags = min(max(10, 2 * order), (v.shape[1] - 1) // 3)
     count = v.shape[1] - 2 * lags + 1
 
     def window(values: NDArray, begins: Sequence[int]) -> NDArray:

@@ -28,8 +28,6 @@ MIN_SIMULATIONS = 10
 LATER, LARGER = 200, 3.0
 """The sample of a later pulse, and the ratio of effects of the first pulse and this one, from which
 the start depends on the first command."""
-FAILED = 0.2
-"""Largest share of the simulations that may fail."""
 
 
 def drawn_parameters(twin: Twin, spread: float) -> tuple[Parameter, ...]:
@@ -118,7 +116,8 @@ class Simulations:
             made = self.twin.simulate(u, seed=int(rng.integers(2**31)), **options)
         except SimulationError as error:
             made, self.reason = error.finished, f"of {count} simulations {len(error.failed)} failed"
-            if len(error.failed) > FAILED * count:
+            # Largest share of the simulations that may fail.
+            if len(error.failed) > 0.2 * count:
                 expected = "simulations that succeed, of commands and parameters as drawn"
                 got = str(error)
                 remedy = "narrow the bounds of the parameters, or give a smaller spread"

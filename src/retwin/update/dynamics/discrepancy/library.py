@@ -28,8 +28,6 @@ SHIFT = 0.2
 knots."""
 SHIFTS = (-2.0, 2.0)
 """Bounds of its ratio to the usual one: those of the next knots."""
-MAX_MONOMIALS = 200
-"""Number of monomials of an equation above which their degree is lowered."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,8 @@ class Library:
         """
         places = range(len(variables))
         degree = self.degree
-        while degree > 1 and comb(len(variables) + degree, degree) > MAX_MONOMIALS:
+        # Number of monomials of an equation above which their degree is lowered.
+        while degree > 1 and comb(len(variables) + degree, degree) > 200:
             degree -= 1
         found = [
             Term(
