@@ -222,10 +222,11 @@ def _start_remarks(
     if not records.mask[:, : round(begin * records.rate)].any(axis=(1, 2)).all():
         return []  # of some nothing was measured there
     better = score_model(model, records, warm_up=begin, started=begin, seed=seed)
+    # Ratio of errors from which starts of records are named.
     found = [
         f"{b.rmse:.4g} in place of {a.rmse:.4g} {units[a.output]} ({a.output})"
         for a, b in zip((each for each in usual if each.who == "model"), better, strict=False)
-        if b.rmse < MUCH * a.rmse
+        if b.rmse < 0.8 * a.rmse
     ]
     if not found:
         return []
@@ -236,17 +237,12 @@ def _start_remarks(
     ]
 
 
-MUCH = 0.8
 """Ratio of errors from which starts of records are named."""
 FOREIGN, NOTHING = 2.0, 0.05
 """Ratio of the error to the spread of a record from which, and share inside the band below which, a
 record may be of another channel or machine."""
-NO_CHANCE = 3.0
-"""Ratio of the error to that of the band from which on a machine differs from the calibration."""
 START = ", or begin in other states, which --warm-up infers"
 """What else may be the reason where starts are not inferred."""
-CLEAR = 0.01
-"""Part of an error by which another predictor must be better to be mentioned."""
 
 
 def _foreign(scores: list[ModelScore]) -> list[str]:
@@ -286,7 +282,8 @@ def _verdict(scores: list[ModelScore], *, started: bool = False, hardly: float =
     for each in (one for one in scores if one.output not in foreign):
         if each.who != "model":
             model = own[each.output]
-            if each.rmse < (1 - CLEAR) * model.rmse:
+            # A hundredth of an error by which another predictor must be better to be mentioned.
+            if each.rmse < 0.99 * model.rmse:
                 made.append(
                     f"{each.output}: {words[each.who]} is a better prediction, by RMSE: "
                     f"{each.rmse:.3g} in place of {model.rmse:.3g}."
@@ -299,7 +296,9 @@ def _verdict(scores: list[ModelScore], *, started: bool = False, hardly: float =
         elif each.coverage < COVERAGE[0]:
             text = f"{each.output}: the 90 % band holds {each.coverage:.0%} of these samples"
             ratio = each.rmse / max(each.width / 2 / USUAL, 1e-300)
-            if ratio > NO_CHANCE:
+            # Ratio of the error to that of the band from which on a machine differs from the
+            # calibration.
+            if ratio > 3.0:
                 made.append(
                     f"{text}, and the RMSE is {ratio:.2g} times what it allows for: this is no "
                     "chance. The machine has changed, as by a fault, or works where the model "

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from retwin.data.quality.finding import Finding
 
-CERTAIN = 0.99
-"""Probability of a diagnosis from which on it contradicts a label."""
 MAJORITY = 0.8
 """Share of the records of a label that are diagnosed as another class, where labels are exchanged;
 and of all other records that are diagnosed as labelled, where single labels are doubtful."""
@@ -39,7 +37,8 @@ def find_wrong_labels(
         Names of the records.
 
     """
-    answers, certain = probabilities.argmax(axis=1), probabilities.max(axis=1) >= CERTAIN
+    # Probability of a diagnosis from which on it contradicts a label.
+    answers, certain = probabilities.argmax(axis=1), probabilities.max(axis=1) >= 0.99
     taken = dict[int, int]()
     for label in np.unique(labels).tolist():
         rows = labels == label

@@ -33,8 +33,6 @@ be counts as much as two observations."""
 TIED = FREEDOM * 2.0 ** np.arange(6)
 """Degrees of freedom between which the data decide for the variances of tied groups, all of them as
 probable beforehand: the more, the more alike these variances are."""
-TOLERANCE = 1e-3
-"""Relative change of all variances below which they have converged."""
 LARGEST = 1e3
 """Largest standard deviation, in units: what outputs hardly show is linear no further."""
 WARM_UP, DRAWS = 20, 100
@@ -241,7 +239,8 @@ class Hierarchy:
         found = self
         for _ in range(max_steps):
             before, found = found, found._step(design, likelihood)
-            if (found.total() / before.total()).log().abs().amax() < TOLERANCE:
+            # Relative change of all variances below which they have converged.
+            if (found.total() / before.total()).log().abs().amax() < 1e-3:
                 break
         return found
 

@@ -27,8 +27,6 @@ REWEIGHTINGS = 3
 """Times that samples are weighted anew within a step: cheap beside a call of the surrogate."""
 DAMPING = 1e-6
 """Damping to begin with, relative to the diagonal of the curvature: next to none."""
-ALIGNED = 0.9
-"""Cosine of the angle between successive moves above which they are extrapolated."""
 LARGEST_RATIO = 0.8
 """Largest ratio of successive moves that is extrapolated: a move is made at most five times."""
 
@@ -333,7 +331,8 @@ def _extrapolation(move: Tensor, before: Tensor, metric: Tensor) -> Tensor:
     own, common = (left[:, 0] * move).sum(dim=1), (left[:, 0] * before).sum(dim=1)
     last = (left[:, 1] * before).sum(dim=1).clamp_min(1e-30)
     ratio = (common / last).clamp(0.0, LARGEST_RATIO)
-    aligned = (common > 0) & (common.square() > ALIGNED**2 * own * last)
+    # Cosine of the angle between successive moves above which they are extrapolated.
+    aligned = (common > 0) & (common.square() > 0.9**2 * own * last)
     return torch.where(aligned, 1 / (1 - ratio), 1.0)
 
 

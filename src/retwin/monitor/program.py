@@ -40,9 +40,6 @@ from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 from retwin.serialisation.files import sha256
 
-INTERVAL = 0.5
-"""Seconds after which new entries of the log are reported."""
-
 
 def run(settings: MonitorSettings, report: Callable[[str], None], stop: threading.Event) -> None:
     """Watch the machines until `stop` is set; what was acknowledged is durable then.
@@ -114,7 +111,8 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
             opened.callback(thread.join)
         opened.callback(stop.set)
         report(f"watching {', '.join(settings.assets)}")
-        while not stop.wait(INTERVAL):
+        # Seconds after which new entries of the log are reported.
+        while not stop.wait(0.5):
             news.read()
 
 

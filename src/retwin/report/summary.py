@@ -33,8 +33,6 @@ from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 from retwin.scores.segments import median_error_trajectory
 from retwin.scores.uses import error_of
 
-MANY_OUTPUTS = 6
-"""Number of outputs beyond which one pair of bars stands for all of them."""
 SEGMENTS = 10
 """Number of segments below which no range of them is shown."""
 BAR = 0.38
@@ -234,7 +232,8 @@ def _bars(study: Study, change: ErrorChange, given: str, source: str) -> Panel:
     factor, unit = (1.0, "σ") if given == "σ" else quantity(given)
     before, after = factor * change.outputs_before, factor * change.outputs_after
     names = study.results.outputs.names
-    if len(before) > MANY_OUTPUTS or len(before) != len(names):
+    # Number of outputs beyond which one pair of bars stands for all of them.
+    if len(before) > 6 or len(before) != len(names):
         before, after = (np.array([factor * each]) for each in (change.before, change.after))
         names = ["all outputs"]
     marks = [

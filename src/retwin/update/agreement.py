@@ -22,8 +22,6 @@ from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.windows import simulated as simulated_outputs
 from retwin.update.forecasts import started_moments
 
-UNEXPLAINED = 0.1
-"""Share of the variance that a twin leaves, below which commands are in their places."""
 DIVERGED = 1e100
 """Size of outputs that no simulation has which does not diverge, and whose square is finite."""
 
@@ -81,7 +79,8 @@ def _find_exchanged(twin: Twin, records: Trajectories, *, clear: float = 0.5) ->
     """
     healthy = records[records.maybe_healthy] if records.maybe_healthy.any() else records
     here, names = _unexplained_share(healthy), records.inputs.names
-    if here < UNEXPLAINED:
+    # Share of the variance that a twin leaves, below which commands are in their places.
+    if here < 0.1:
         return
     # Pairs of commands that are tried, at most.
     for a, b in list(combinations(range(len(names)), 2))[:15]:

@@ -31,8 +31,6 @@ from retwin.update.forecast_errors import (
     value_range,
 )
 
-DRAWS = 100
-"""Simulations of a trajectory whose mean and deviation stand for a distribution."""
 LEADS = (1, 3, 10, 30, 100)
 """Samples ahead at which errors are calibrated."""
 BEGIN = 10
@@ -59,7 +57,8 @@ def free_moments(twin: Twin, commands: NDArray, *, seed: int = 0) -> tuple[NDArr
         return mean.numpy(), found.variance.double().sqrt().numpy()
     moments = []
     for i, each in enumerate(values):
-        drawn = twin.simulate(np.tile(each, (DRAWS, 1, 1)), seed=seed + i).observed
+        # Simulations of a trajectory whose mean and deviation stand for a distribution.
+        drawn = twin.simulate(np.tile(each, (100, 1, 1)), seed=seed + i).observed
         moments.append((drawn.mean(axis=0, dtype=np.float64), drawn.std(axis=0, dtype=np.float64)))
     means, deviations = (np.stack(each) for each in zip(*moments, strict=True))
     return means, deviations

@@ -9,9 +9,6 @@ from scipy.stats import t as student
 
 NORMAL_95 = 1.96
 """Standard errors from an estimate to an end of its 95 % interval."""
-SHARED = 0.5
-"""Share of the information on a direction that one block may have: beyond it, as with the start of
-a state, sums over blocks say nothing of the error."""
 
 
 def score_covariance(score: NDArray, residual: NDArray, measured: int) -> tuple[NDArray, NDArray]:
@@ -65,7 +62,9 @@ def score_covariance(score: NDArray, residual: NDArray, measured: int) -> tuple[
     sums -= sums.mean(axis=0)
     count = np.zeros((number, size))
     np.add.at(count, block.ravel(), (score**2).sum(axis=2).reshape(-1, size))
-    spread = number > 1 and (count.max(axis=0) < SHARED * np.maximum(count.sum(axis=0), 1e-300))
+    # Share of the information on a direction that one block may have: beyond it, as with the start
+    # of a state, sums over blocks say nothing of the error.
+    spread = number > 1 and (count.max(axis=0) < 0.5 * np.maximum(count.sum(axis=0), 1e-300))
     by_blocks = sums.T @ sums * number / max(number - 1, 1)
     usual = np.maximum(np.diag(covariance), 1e-300)
     factor = np.sqrt(np.where(spread, np.diag(by_blocks) / usual, 0.0))

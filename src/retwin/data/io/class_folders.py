@@ -23,8 +23,6 @@ from retwin.serialisation.sizes import Budget
 from retwin.workers.isolation import FileReader
 
 Reader = Callable[[Path, str, "DataCase | None", Budget, FileReader], Raw]
-COORDINATES = 3
-"""Outputs per sample in the arm's authors' files: x, y and z."""
 VARIABLES = ("trajCmds", "trajResps", "dataset", "motorCmdsRadius")
 """The variables of these files that are read."""
 BYTES_PER_BLOCK, BYTES_PER_NUMBER = 2**20, 8
@@ -119,7 +117,8 @@ def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget, _: 
 def _read_dataset(
     file: Path, where: str, case: DataCase | None, budget: Budget, reader: FileReader
 ) -> Raw:
-    width = len(case.outputs) if case is not None else COORDINATES
+    # Outputs per sample in the arm's authors' files: x, y and z.
+    width = len(case.outputs) if case is not None else 3
     paths = mat_variables(file, budget, reader, VARIABLES)
     if {"trajCmds", "trajResps"} <= set(paths):
         nominal = _upright(paths["trajCmds"], width, f"{where}: trajCmds")

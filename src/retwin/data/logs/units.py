@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from retwin.checks import needs_extra, require
 from retwin.errors import InputError, brief
 
-LONGEST = 40
-"""Characters of a unit at most."""
 SAFE = re.compile(r"[\w°µμΩ%²³⁰¹⁴-⁹⁻·*/^ ().+-]*")
 POWER_OF_NUMBER = re.compile(r"[\d)]\s*(\*\*|\^)")
 """Powers of numbers and of brackets, whose evaluation may never end; units need none."""
@@ -143,7 +141,8 @@ def _unit(text: str) -> Any:
     text = SPELT.get(text.strip(), text.strip())
     for pattern, spelt in RULES:
         text = pattern.sub(spelt, text)
-    if len(text) > LONGEST or not SAFE.fullmatch(text) or POWER_OF_NUMBER.search(text):
+    # Characters of a unit at most.
+    if len(text) > 40 or not SAFE.fullmatch(text) or POWER_OF_NUMBER.search(text):
         raise ValueError("what is no unit")
     return _registry().Unit("" if text.lower() in NONE else text)
 

@@ -16,9 +16,6 @@ from retwin.update.corrections.delays import gather_samples
 from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
 
-MAX_EARLY = 0.5
-"""Share of draws at most whose delay is before the command; they get none."""
-
 
 @dataclass(frozen=True, eq=False)
 class Draws:
@@ -160,7 +157,8 @@ def drawn(
     centre = target.mean(dim=0)
     early = float((z[:, 0] < 0).double().mean())
     got = f"delays of which {early:.0%} are before the command"
-    _refuse(early > MAX_EARLY, got, "check the clocks of commands and outputs")
+    # Share of draws at most whose delay is before the command; they get none.
+    _refuse(early > 0.5, got, "check the clocks of commands and outputs")
     missed = mean[segment, 1 + width :]
     return Draws(
         delay=z[:, :1].clamp_min(0) / twin.rate,

@@ -31,9 +31,6 @@ IMPLAUSIBLE = 100.0
 """Ranges of a command in calibration by which it may leave that range. What is farther away stands
 for a missing one, such as 1e9 or 3.4e38; a filter that took it for real would predict nothing until
 the states have decayed from there."""
-SETTLED = 1.05
-"""Ratio of predicted standard deviations, for starts of which one is twice as uncertain, up to
-which the filter knows the states of a machine that it did not see start."""
 WIDER = 1.25 ** np.arange(1, 17)
 """Factors of the slack of which the first is taken with which the calibration agrees."""
 
@@ -114,7 +111,9 @@ def settled(online: OnlineFilter, count: int, given: tuple[NDArray, ...]) -> int
     )
     ratio = own / other
     # Where nothing is measured, as after the end of a shorter record, nothing is known better.
-    differs = ((np.abs(np.log(ratio)) > 2 * np.log(SETTLED)) & given[2]).any(axis=(0, 2))
+    # Ratio of predicted standard deviations, for starts of which one is twice as uncertain, up to
+    # which the filter knows the states of a machine that it did not see start.
+    differs = ((np.abs(np.log(ratio)) > 2 * np.log(1.05)) & given[2]).any(axis=(0, 2))
     differs = differs[: own.shape[1] // 2]
     return int(np.flatnonzero(differs)[-1]) + 1 if differs.any() else 0
 

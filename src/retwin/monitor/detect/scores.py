@@ -18,8 +18,6 @@ MIN_ERRORS = 8
 """Calibration errors per stream, at least."""
 COPIES = 8
 """Places inside a rounding interval that stand for a rounded error."""
-NEAR = 10.0
-"""Steps up to which a difference is counted with a step that is not exact yet."""
 SCALES = np.geomspace(0.05, 2, 32)
 """Standard deviations of errors before rounding, relative to those after it."""
 
@@ -200,7 +198,8 @@ def _step_of(seen: NDArray, *, inexact: float = 0.05, repeated_share: float = 0.
     offsets, gaps = values - values[0], np.diff(values)
     for step in np.unique(gaps)[::-1]:
         # Small gaps first, since the error of a step adds up over many.
-        near = gaps < NEAR * step
+        # Steps up to which a difference is counted with a step that is not exact yet.
+        near = gaps < 10.0 * step
         many = np.round(gaps[near] / step)
         better = float(many @ gaps[near] / (many @ many))
         number = np.concatenate([[0], np.cumsum(np.round(gaps / better))])

@@ -144,14 +144,6 @@ def _useful(residual: NDArray) -> bool:
     return len(values) > 16 and bool(np.ptp(values) > 0)
 
 
-STRONG = 0.9
-"""Correlation from which a cell is emphasised."""
-DIRECTIONS = 8
-"""Combinations of parameters that are shown, at most."""
-MATRIX = 12
-"""Parameters of which a table of all correlations is shown, at most."""
-
-
 def identification_page(
     found: Identification,
     values: Mapping[str, Any],
@@ -224,13 +216,14 @@ def _parameters(found: Identification) -> Table:
 
 
 def _directions(found: Identification) -> Table:
+    # Combinations of parameters that are shown, at most.
     rows = [
         [
             texts.combination(each),
             significant(each.error) if each.error < 1e6 else "infinite",
             Cell("open" if each.open else "determined", tone="open" if each.open else ""),
         ]
-        for each in found.directions[: -DIRECTIONS - 1 : -1]
+        for each in found.directions[:-9:-1]
     ]
     title = "Combinations of parameters, from the least determined on"
     return tabulate(title, ["combination", "standard error", text_column("")], rows)
@@ -238,11 +231,13 @@ def _directions(found: Identification) -> Table:
 
 def _correlations(found: Identification) -> Table | None:
     names = [each.name for each in found.parameters]
-    if not 1 < len(names) <= MATRIX:
+    # Parameters of which a table of all correlations is shown, at most.
+    if not 1 < len(names) <= 12:
         return None
 
     def cell(r: float) -> Cell:
-        return Cell(signed(r, 2) if abs(r) <= 1.001 else "–", best=abs(r) > STRONG)
+        # Correlation from which a cell is emphasised.
+        return Cell(signed(r, 2) if abs(r) <= 1.001 else "–", best=abs(r) > 0.9)
 
     rows = [
         [name, *map(cell, found.correlation[i, :i].tolist()), *[""] * (len(names) - 1 - i)]

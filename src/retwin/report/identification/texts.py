@@ -22,14 +22,8 @@ SENTENCES = 4
 """Outputs that have a sentence of their own, at most."""
 SMALL = 0.02
 """Ratio of errors below which a change in percent has decimals."""
-ELSEWHERE = 2.0
-"""Ratio of the errors at the begin of trajectories and later, from which it is named."""
-STRONG = 0.95
-"""Correlation of two estimates from which they are named."""
 OWN_START = "mean of the records"
 """What a start is of which each record has its own."""
-MISFIT = 0.02
-"""Prior predictive p-value below which measurements do not fit the twin."""
 
 
 def value(each: ParameterEstimate) -> str:
@@ -152,10 +146,13 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
     pairs = [
         (names[j], names[i], found.correlation[i, j]) for i in range(len(names)) for j in range(i)
     ]
-    strong = [f"{a} and {b} ({signed(r, 2)})" for a, b, r in pairs if abs(r) > STRONG]
+    # Correlation of two estimates from which they are named.
+    strong = [f"{a} and {b} ({signed(r, 2)})" for a, b, r in pairs if abs(r) > 0.95]
     means = {each.name: each.mean for each in found.outputs}
     unknown = [p for p in found.parameters if not (p.identified or p.at_bound or p.depends)]
     measured = found.simulated["identification"][0]
+    # Ratio of the errors at the begin of trajectories and later, from which it is named.
+    # Prior predictive p-value below which measurements do not fit the twin.
     return sentences(
         "findings",
         found=found,
@@ -176,7 +173,7 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
         worse=[name for name, each in errors if each.after >= means[name]],
         whole=next((each.error for each in horizons if each.length is None), None),
         settable=state_based(found.twin),
-        larger=[pair for pair in found.begin_errors.items() if pair[1] > ELSEWHERE],
+        larger=[pair for pair in found.begin_errors.items() if pair[1] > 2.0],
         tenth=float(f"{measured.lengths.max() / measured.rate / BEGIN:.2g}"),
         started=any(each.name.startswith("start_") for each in found.parameters),
         own=[each.name for each in found.parameters if each.own],
@@ -192,7 +189,7 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
         coloured=_coloured(found),
         white=WHITE,
         driven=_driven(found)[: 2 * SENTENCES],
-        misfit=MISFIT,
+        misfit=0.02,
         without_error=any(isnan(p.error) and not p.at_bound for p in found.parameters),
     )
 

@@ -15,9 +15,6 @@ from retwin.report.verdict import headline
 from retwin.results import ChannelNames, Dataset, FidelityFigure, Results
 from retwin.scores.classification import row_shares
 
-SIGNIFICANT = 0.05
-"""The p-value at or below which generated and observed values count as different."""
-
 
 def card(study: Study) -> Section:
     """Of the headline's updated twin, else of the first source."""
@@ -45,10 +42,11 @@ def card(study: Study) -> Section:
 def unlike(study: Study, source: str) -> list[tuple[str, FidelityFigure]]:
     """The components of z whose generated and observed values differ, with their KS distance."""
     fidelity = study.results.fidelity.get(source)
+    # The p-value at or below which generated and observed values count as different.
     return [
         (latent_names(name)[0], figure)
         for name, figure in (fidelity.agreement if fidelity else {}).items()
-        if figure.p is not None and figure.p <= SIGNIFICANT
+        if figure.p is not None and figure.p <= 0.05
     ]
 
 

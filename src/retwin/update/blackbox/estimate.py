@@ -27,18 +27,8 @@ from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 from retwin.update.forecast_errors import value_range
 
-MAX_REFITTED_SAMPLES = 100_000
-"""Samples that are fitted again and again, without each part in turn; of longer records fewer
-parts are held out."""
-WORTH = 0.99
-"""Ratio of held-out errors below which a larger order is better."""
 PATIENCE = 2
 """Orders, or strengths of a prior, that are tried beyond the best one."""
-STRONGEST = 1000.0
-"""Variance of the error of an effective sample that is assumed first, over that of the model where
-it begins: a prior so strong that nonlinear terms begin near 0."""
-SAME = 0.1
-"""Logarithm of the ratio of two variances below which they agree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +155,8 @@ def best_order(
     for done, order in enumerate(orders, 1):
         found = fit(order)
         error = np.inf if found is None else found.held_out
-        if found is not None and error < (WORTH * best[1].held_out if best else np.inf):
+        # Ratio of held-out errors below which a larger order is better.
+        if found is not None and error < (0.99 * best[1].held_out if best else np.inf):
             best = order, found
         if progress is not None:
             progress(0.9 * done / len(orders))
@@ -193,7 +184,9 @@ def held_out_parts(seen: NDArray, *, folds: int = 10) -> list[NDArray]:
     trajectories, samples, _ = seen.shape
     block = np.arange(samples) * (folds + 1) // samples
     own = (block - 1 + np.arange(trajectories)[:, None]) % folds
-    count = int(np.clip(MAX_REFITTED_SAMPLES // max(1, seen.sum()), 1, folds))
+    # Samples that are fitted again and again, without each part in turn; of longer records fewer
+    # parts are held out.
+    count = int(np.clip(100_000 // max(1, seen.sum()), 1, folds))
     return [(own == part) & (block > 0) for part in range(count)]
 
 
@@ -266,7 +259,9 @@ def with_best_prior(start: Callable[[NDArray], BlackBoxFit], seen: NDArray) -> B
     whole, fits = start(np.zeros(seen.shape[:2], dtype=bool)), [start(part) for part in parts]
     if not all(each.estimation.linearised(each.point).finite for each in fits):
         return None
-    variance = STRONGEST * observed_variance(fits[0].estimation, fits[0].point)
+    # Variance of the error of an effective sample that is assumed first, over that of the model
+    # where it begins: a prior so strong that nonlinear terms begin near 0.
+    variance = 1000.0 * observed_variance(fits[0].estimation, fits[0].point)
     best, least, since = fits[0], np.inf, 0
     # Number of variances at most.
     for _ in range(8):
@@ -303,7 +298,8 @@ def followed(estimation: Estimation, point: Point, *, max_passes: int = 6) -> Bl
         return None
     for _ in range(max_passes):
         variance = observed_variance(estimation, point)
-        settled = np.all(np.abs(np.log(variance / estimation.variance)) < SAME)
+        # Logarithm of the ratio of two variances below which they agree.
+        settled = np.all(np.abs(np.log(variance / estimation.variance)) < 0.1)
         estimation = replace(estimation, variance=variance)
         if settled:
             break

@@ -31,13 +31,6 @@ from retwin.update.dynamics.unknowns import coefficients_of
 WIDER = 4.0
 """Bound of outputs, in half widths of their range in calibration about its centre: a simulation
 that diverges is held there, and the model warns that it leaves the range."""
-MARGIN = 1.0
-"""How far samples before the first one may lie beyond the range of a channel, in widths of it."""
-SIGNIFICANT = 12.0
-"""What a term explains at least, over the variance of the error that is left: the largest of some
-hundred terms explains as much of white noise with a probability of 5 %."""
-DISTINCT = 1e-5
-"""Norm of what a term of norm 1 has beyond the chosen ones, below which it is a combination."""
 
 
 def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> estimate.BlackBox:
@@ -103,7 +96,9 @@ class Polynomial:
         channels = (lags.observed.outputs, lags.observed.inputs)
         units = [unit for each in channels for _ in range(lags.order) for unit in each.units]
         low, high = (each[: len(units)] for each in (lags.domain.low, lags.domain.high))
-        margin = MARGIN * np.where(high > low, high - low, 1.0)
+        # How far samples before the first one may lie beyond the range of a channel, in widths of
+        # it.
+        margin = 1.0 * np.where(high > low, high - low, 1.0)
         columns = (self.starts.mean(axis=0), low - margin, high + margin)
         numbers = (each.tolist() for each in columns)
         return [State(*each) for each in zip(lags.names, units, *numbers, strict=True)]
@@ -194,9 +189,12 @@ def forward(columns: NDArray, target: NDArray, count: int, first: list[int]) -> 
     while len(chosen) < min(count, columns.shape[1]):
         size = np.linalg.norm(rest, axis=0)
         size[chosen] = 0.0
-        gain = np.divide(rest.T @ left, size, out=np.zeros(len(size)), where=size > DISTINCT)
+        # Norm of what a term of norm 1 has beyond the chosen ones, below which it is a combination.
+        gain = np.divide(rest.T @ left, size, out=np.zeros(len(size)), where=size > 1e-5)
         best = int(np.argmax(np.abs(gain)))
-        if gain[best] ** 2 <= SIGNIFICANT * (left @ left) / len(left):
+        # What a term explains at least, over the variance of the error that is left: the largest of
+        # some hundred terms explains as much of white noise with a probability of 5 %.
+        if gain[best] ** 2 <= 12.0 * (left @ left) / len(left):
             break
         direction = rest[:, best] / size[best]
         left -= direction * (direction @ left)

@@ -38,8 +38,6 @@ from retwin.update.state_surrogate.equations import ChannelScale, Equations
 
 WIDTHS = (2, 16)
 """Least and largest width of the hidden layer."""
-START = 3.0
-"""Bound of the states at the first sample, over their largest value in the linear model."""
 
 
 def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) -> BlackBox:
@@ -57,7 +55,8 @@ def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) 
         if found is None:
             return None
         equations, starts = begin_with(own, found, np.random.default_rng(seed))
-        states = states_within(starts, START * max(1.0, float(np.abs(starts).max())))
+        # Bound of the states at the first sample, over their largest value in the linear model.
+        states = states_within(starts, 3.0 * max(1.0, float(np.abs(starts).max())))
         twin = equations.trainable(observed, states)
 
         def start(part: NDArray) -> BlackBoxFit:

@@ -34,9 +34,6 @@ measured at all."""
 KNOWN_DELAY = 1 / 8
 """Standard deviation above which a delay is not identified by default, in widths of its range: less
 than half of that of a delay of which nothing is known."""
-SIGNIFICANT = 3.0
-"""Way of a motion, in standard deviations of the step between its offsets, below which noise could
-have made it: its delay is then not identified."""
 
 
 @dataclass(frozen=True)
@@ -213,4 +210,6 @@ def _moves(problem: PathProblem, z: Tensor, deviation: Tensor) -> Tensor:
     inside = within(problem.sample, start + z[..., 0], settle + z[..., 0] + 1)
     variance = deviation[..., 1:].square()
     before = torch.cat([torch.zeros_like(variance[:, :1]), variance[:, :-1]], dim=1)
-    return (inside.to(way) @ way > SIGNIFICANT * (variance + before).sqrt()).any(dim=-1)
+    # Way of a motion, in standard deviations of the step between its offsets, below which noise
+    # could have made it: its delay is then not identified.
+    return (inside.to(way) @ way > 3.0 * (variance + before).sqrt()).any(dim=-1)

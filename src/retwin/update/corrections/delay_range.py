@@ -26,8 +26,6 @@ EARLIEST, LATEST = -0.5, 1.0
 """Limits of the wide grid, in median lengths of a segment."""
 QUANTILES = (0.05, 0.95)
 """Quantiles of the delays of single segments: a few missed segments do not count."""
-SHORTEST = 0.1
-"""Smallest margin beyond the delays that are found, in median durations of a motion."""
 
 
 def checked_range(delay_range: tuple[float, float] | None) -> None:
@@ -111,7 +109,8 @@ def plausible_delays(context: Context, observed: Tensor, mask: Tensor) -> tuple[
     x = x.flatten(1)
     common = common_delay(problem, x, limits)
     moves = _moves(problem, x)
-    least = max(math.ceil(SHORTEST * motion), 2)
+    # Smallest margin beyond the delays that are found, in median durations of a motion.
+    least = max(math.ceil(0.1 * motion), 2)
     half = max(abs(common), least)
     while True:
         near = common - half, common + half

@@ -28,9 +28,6 @@ __all__ = ["Candidate", "best_of", "better", "searched", "without_discrepancy"]
 STEP = (2.0, 3.0)
 """Least and largest ratio of that variance to the next one: larger steps leave the optimum that the
 search follows."""
-HELD = 1e-3
-"""Standard deviation of what the outputs of the twin alone do not determine, in those of the
-parameters if each were the only one: a discrepancy would determine it by its prior alone."""
 OPEN, MAX_OPEN = 2, 100
 """Degree of the monomials of all states and commands in each equation, and number of coefficients
 above which they are not tried."""
@@ -103,7 +100,9 @@ def without_discrepancy(
 
 def hold_confounded(estimation: Estimation, found: Linearised) -> Estimation:
     """The same with combinations of shared coordinates held of which the samples say nothing."""
-    combinations, there = estimation.confounded(found) / HELD, found.point.shared
+    # Standard deviation of what the outputs of the twin alone do not determine, in those of the
+    # parameters if each were the only one: a discrepancy would determine it by its prior alone.
+    combinations, there = estimation.confounded(found) / 1e-3, found.point.shared
 
     def held(shared: NDArray) -> tuple[NDArray, NDArray]:
         return combinations @ (shared - there), combinations

@@ -32,8 +32,6 @@ __all__ = ["Estimation", "correlation_time", "estimate_starts", "root"]
 
 MAX_STEPS = 60
 """Steps of the trust-region method at most."""
-TOLERANCE = 1e-2
-"""Norm of the gradient, in nats per prior or posterior deviation, at which the search ends."""
 IDLE = (5, 0.03)
 """Number of successive steps, each of which gains less than so many nats, at which the search ends:
 of inner coefficients of terms that hardly matter next to nothing is known."""
@@ -41,11 +39,6 @@ WIDEST = 1e6
 """Largest trust region, in posterior deviations at the start of the search."""
 RESOLUTION = 1e-12
 """Smallest variance that counts, over that of an output: about that of single precision."""
-ACCEPTED = 0.15
-"""Ratio of the decrease of the objective to that of its quadratic approximation, from which a step
-is made."""
-ROUNDS = 3
-"""Estimates of the starts of a record, of which each takes the errors of the one before."""
 CHUNK = 2**20
 """Number of derivatives that are computed at once, unless one trajectory has more: 8 MB."""
 
@@ -187,7 +180,9 @@ class Estimation:
         unit = curvature.unit
         radius, idle = WIDEST / 1e3, 0
         for _ in range(steps):
-            if np.linalg.norm(unit * gradient) < TOLERANCE or idle == IDLE[0]:
+            # Norm of the gradient, in nats per prior or posterior deviation, at which the search
+            # ends.
+            if np.linalg.norm(unit * gradient) < 1e-2 or idle == IDLE[0]:
                 break
             scaled = curvature.scaled(unit)
             ends = ((each - flat) / unit for each in self.bounds)
@@ -204,7 +199,9 @@ class Estimation:
                 radius = length / 4
             elif ratio > 0.75:
                 radius = max(radius, min(2 * length, WIDEST))
-            if ratio > ACCEPTED:
+            # Ratio of the decrease of the objective to that of its quadratic approximation, from
+            # which a step is made.
+            if ratio > 0.15:
                 idle = idle + 1 if value - found[0] < IDLE[1] else 0
                 at, flat, (value, gradient, curvature) = tried, inside, found
                 # What did not act at the start may act now, and its unit was without meaning.
@@ -413,7 +410,8 @@ def estimate_starts(
     remedy = "it leaves what the equations were corrected for: fit them to records like this "
     remedy += "one, or take the twin with identified parameters alone"
     require(finite, "record", expected=expected, got=got, remedy=remedy)
-    for i in range(1 if variance is not None else ROUNDS):
+    # Estimates of the starts of a record, of which each takes the errors of the one before.
+    for i in range(1 if variance is not None else 3):
         if variance is None:
             own = replace(own, variance=own.power(found.residual) if i else own.spread)
         found = own.minimised(found)

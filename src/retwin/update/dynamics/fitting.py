@@ -41,9 +41,6 @@ from retwin.workers.threads import one_thread
 
 __all__ = ["FittedDynamics", "assembled", "fit_dynamics"]
 
-NONLINEAR = 1.5
-"""Ratio of the errors of a simulation to those of a linear step, from which on the step is none."""
-
 
 @dataclass(frozen=True, eq=False)
 class FittedDynamics:
@@ -302,7 +299,9 @@ def _trusted(
             continue
         residual = estimation.residual(Point(found.shared + move, found.starts))[part]
         linear = held_out.errors[part]
-        if np.sum(residual**2) <= NONLINEAR**2 * np.sum(linear**2):
+        # Ratio of the errors of a simulation to those of a linear step, from which on the step is
+        # none.
+        if np.sum(residual**2) <= 1.5**2 * np.sum(linear**2):
             moves[k] = move
     return moves
 

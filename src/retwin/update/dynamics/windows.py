@@ -27,10 +27,6 @@ from retwin.update.dynamics.estimation import Estimation
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
 
-RESOLUTION = 1e-3
-"""Error of a sample, over the standard deviation of its output, to a hundredth of which the starts
-are found."""
-
 
 @dataclass(frozen=True, eq=False)
 class Windows:
@@ -94,7 +90,9 @@ class Windows:
             rate=self.observed.rate,
         )
         spread = (spread_of(cut) / self.unit).max(initial=0.0)
-        variance = (RESOLUTION * (spread or 1.0) * self.unit) ** 2
+        # Error of a sample, over the standard deviation of its output, to a hundredth of which the
+        # starts are found.
+        variance = (1e-3 * (spread or 1.0) * self.unit) ** 2
         base = state_twin_of(self.twin)[0]
         return Estimation(base, cut, self._unknowns(self.twin), own, variance)
 

@@ -18,9 +18,6 @@ from retwin.update.dynamics.windows import sampled, spread_of, state_based, wind
 LONGEST, RATIO = 10, 3
 """The longest window is the record by the first number; each other one is the one before by the
 second. So a part that is left out contains two of the longest."""
-OVERFITTED = 2.0
-"""Ratio of the errors of parts of a record that were left out to those of the fit, from which on
-the parameters of whole records count as overfitted."""
 
 Fit = Callable[[Trajectories, int | None], ParametricTwin]
 """Fits a twin to measurements, in windows of so many samples or None for whole records."""
@@ -184,7 +181,9 @@ def overfitted(held: HeldOut, residual: NDArray, without: Sequence[ParametricTwi
     )
     alone, inside = np.exp(2 * held.errors(without, ())[:, 0]), np.exp(2 * fitted)
     known = np.isfinite(alone) & np.isfinite(inside)
-    return bool(alone[known].sum() > OVERFITTED**2 * inside[known].sum())
+    # Ratio of the errors of parts of a record that were left out to those of the fit, from which on
+    # the parameters of whole records count as overfitted.
+    return bool(alone[known].sum() > 2.0**2 * inside[known].sum())
 
 
 def choose_length(held: HeldOut, whole: Sequence[ParametricTwin | None] | None) -> list[Candidate]:

@@ -16,8 +16,6 @@ from retwin.update.residual.residual import Residual
 DRAWS = 59
 """Draws of each trajectory: a measured sample has one of 60 ranks among them, all equally probable
 if the model is right."""
-MAX_TRAJECTORIES = 60
-"""Trajectories that are compared, so that it takes seconds."""
 TOO_FEW = 0.7
 """Share of measured samples in a band of 90 % below which a warning is given: it misses three times
 as many as it states."""
@@ -68,7 +66,8 @@ def coverage_figures(
         interval over trajectories.
 
     """
-    part = slice(0, MAX_TRAJECTORIES)
+    # Trajectories that are compared, so that it takes seconds.
+    part = slice(0, 60)
     shares = coverage(model, context[part], observed[part], mask[part], seed=seed)
     figures, low = {}, {}
     for name, own in zip(model.outputs.names, shares.T, strict=True):

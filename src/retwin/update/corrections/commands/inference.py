@@ -40,21 +40,10 @@ from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.sample_noise import SampleNoise
 from retwin.workers.threads import one_thread
 
-SUSPECT = 2.5
-"""Standard deviations of the prior beyond which an offset makes a segment suspect."""
 MOVING = 3.0
 """Distance, in standard deviations of an offset, above which an actuator is to move."""
-OUTLYING = 3.0
-"""Noise scales beyond which a sample is an outlier."""
-OUTLYING_SHARE = 0.3
-"""Share of outliers above which a segment is suspect."""
 FIRST_JITTER = 1 / 35
 """Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
-SMALLEST_SHARE = 0.1
-"""Smallest share of the samples that is taken to be left after z* has been fitted to them."""
-PREDICTED = 20
-"""Runs, measured and predicted, from which a distribution is learned: as many trajectories as a
-residual model is calibrated on. Of fewer, the hyperparameters' posterior predicts the rest."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -189,10 +178,13 @@ def _suspects(
     offsets = slice(1, 1 + part.missed.shape[2])
     width = part.per_segment(prior.gaussian.deviation[rows])[..., offsets]
     away = part.per_segment(x - prior.gaussian.mean[rows])[..., offsets]
-    far = (away.abs() > SUSPECT * width) & part.healthy
-    outlying = noise.square(part, part.residual(x)) > OUTLYING**2
+    # Standard deviations of the prior beyond which an offset makes a segment suspect.
+    far = (away.abs() > 2.5 * width) & part.healthy
+    # Noise scales beyond which a sample is an outlier.
+    outlying = noise.square(part, part.residual(x)) > 3.0**2
     share = (part.inside * outlying[:, None]).sum(dim=-1) / part.inside.sum(dim=-1).clamp_min(1)
-    suspect = far.any(dim=-1) | (share > OUTLYING_SHARE)
+    # Share of outliers above which a segment is suspect.
+    suspect = far.any(dim=-1) | (share > 0.3)
     moving = part.way > MOVING * width
     flips = suspect[..., None] & moving & part.healthy | (part.missed > 0.5)
     row, segment, actuator = flips.nonzero().unbind(dim=1)
@@ -328,7 +320,8 @@ class Hyperparameters:
         covariance = self.hierarchy.posterior_covariance(design, likelihood)
         fitted = (likelihood.curvature * covariance).sum()  # dimensions that outputs determine
         count = white.measured.sum() * white.observed.shape[2]
-        left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
+        # Smallest share of the samples that is taken to be left after z* has been fitted to them.
+        left = (1 - fitted / count.clamp_min(1.0)).clamp(0.1, 1.0)
         rest, path = learned.thinning
         rest = rest.clamp_min(white.creep(learned, residual))
         thinning = torch.stack([rest, path])
@@ -412,7 +405,9 @@ def _predict_runs(
 
     None from enough runs.
     """
-    further = PREDICTED - len(problem)
+    # Runs, measured and predicted, from which a distribution is learned: as many trajectories as a
+    # residual model is calibrated on. Of fewer, the hyperparameters' posterior predicts the rest.
+    further = 20 - len(problem)
     if further <= 0:
         return None
     rng, runs = np.random.default_rng(2), []

@@ -29,20 +29,12 @@ from retwin.update.corrections.sampled_sensor import lattice_step
 from retwin.update.corrections.surrogate_slopes import differences, outputs_at, slopes_at
 from retwin.update.kernels.generation import linearised_outputs
 
-SURROGATE_STEP = 0.05
-"""Step of finite differences of delays through a surrogate with memory, in samples: larger than the
-rounding of single precision."""
 COMMAND_STEP = 1e-4
 """Step of finite differences through the effective commands, which are piecewise linear in x."""
 COMMON_ERROR = 0.25
 """Variance of the error that all samples of a segment have in common, relative to that of one
 sample: what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
 resolution. Outputs cannot tell it from an offset, so it is no estimate."""
-HYPERPRIOR_RESTS = 2.0
-"""Rests without any creep that are assumed besides those measured."""
-LARGE_ERROR = 2.0
-"""Error of the surrogate, in that of half of the samples, beyond which nothing is learned from a
-segment but its own z."""
 GAIN_STEP = 5e-3
 """Step of the finite differences of the gain, in standard deviations of a command."""
 TRAJECTORIES_PER_BATCH = 64
@@ -212,7 +204,9 @@ class CommandProblem(DelayProblem):
             return self
         variance = self.common.variance.mean(dim=-1)
         known = (self.measured > 0) & (self.common.block > 0)
-        limit = LARGE_ERROR**2 * variance[known].median() if known.any() else torch.inf
+        # Error of the surrogate, in that of half of the samples, beyond which nothing is learned
+        # from a segment but its own z.
+        limit = 2.0**2 * variance[known].median() if known.any() else torch.inf
         return replace(self, common=None, measured=self.measured * (variance <= limit))
 
     @property
@@ -279,7 +273,8 @@ class CommandProblem(DelayProblem):
             means.append(half @ residual / weight[-1][..., None])
         apart = ((means[0] - means[1]).square() / noise.scale[0].square()).mean(dim=-1)
         excess = (apart - 1 / weight[0] - 1 / weight[1])[count >= samples_of_halves]
-        common = COMMON_ERROR + max(0.0, float(excess.sum()) / (len(excess) + HYPERPRIOR_RESTS))
+        # Rests without any creep that are assumed besides those measured.
+        common = COMMON_ERROR + max(0.0, float(excess.sum()) / (len(excess) + 2.0))
         return 1 + common * float(count.sum()) / max(1.0, float(self.valid.sum()))
 
     @property
@@ -384,7 +379,9 @@ class CommandProblem(DelayProblem):
     def _linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if self.memory:
             residual = self._residual(x)
-            delay = torch.full((self.size - len(self.spread),), SURROGATE_STEP)
+            # Step of finite differences of delays through a surrogate with memory, in samples:
+            # larger than the rounding of single precision.
+            delay = torch.full((self.size - len(self.spread),), 0.05)
             step = torch.cat([delay[:1], GAIN_STEP * self.spread, delay[1:]])
             moves = torch.diag(step.to(x).repeat(self.missed.shape[1]))
             columns = [(residual - self._residual(x + each)) / each.sum() for each in moves]

@@ -23,9 +23,6 @@ WIDTH = 0.05
 WIDTHS = (-4.0, 3.0)
 """Bounds of the logarithm of its ratio to the usual one: from a thousandth of the half range to all
 of it."""
-SHIFT = 0.2
-"""Usual distance of a hinge from its knot, in half ranges of its variable: half of that between two
-knots."""
 SHIFTS = (-2.0, 2.0)
 """Bounds of its ratio to the usual one: those of the next knots."""
 
@@ -149,7 +146,9 @@ def _direction(chosen: Sequence[int], i: int) -> int | None:
 
 
 def _hinge(v: Sequence[Any], shift: Any = 0.0, *, i: int, sign: int, knot: float) -> Any:
-    return torch.relu(sign * v[i] - knot - SHIFT * shift)
+    # Usual distance of a hinge from its knot, in half ranges of its variable: half of that between
+    # two knots.
+    return torch.relu(sign * v[i] - knot - 0.2 * shift)
 
 
 def _sign(v: Sequence[Any], width: Any, i: int, zero: float) -> Any:
