@@ -96,9 +96,8 @@ class Polynomial:
         channels = (lags.observed.outputs, lags.observed.inputs)
         units = [unit for each in channels for _ in range(lags.order) for unit in each.units]
         low, high = (each[: len(units)] for each in (lags.domain.low, lags.domain.high))
-        # How far samples before the first one may lie beyond the range of a channel, in widths of
-        # it.
-        margin = 1.0 * np.where(high > low, high - low, 1.0)
+        # Samples before the first one may lie by its width beyond the range of a channel.
+        margin = np.where(high > low, high - low, 1.0)
         columns = (self.starts.mean(axis=0), low - margin, high + margin)
         numbers = (each.tolist() for each in columns)
         return [State(*each) for each in zip(lags.names, units, *numbers, strict=True)]
