@@ -12,8 +12,6 @@ from retwin.data.quality.finding import Finding
 MAJORITY = 0.8
 """Share of the records of a label that are diagnosed as another class, where labels are exchanged;
 and of all other records that are diagnosed as labelled, where single labels are doubtful."""
-MIN_RECORDS = 3
-"""Records of a label from which on it may be exchanged as a whole."""
 
 
 def find_wrong_labels(
@@ -44,7 +42,8 @@ def find_wrong_labels(
         rows = labels == label
         counts = np.bincount(answers[rows & certain], minlength=len(classes))
         answer = int(counts.argmax())
-        if answer != label and counts[answer] >= max(MIN_RECORDS, MAJORITY * rows.sum()):
+        # Records of a label from which on it may be exchanged as a whole.
+        if answer != label and counts[answer] >= max(3, MAJORITY * rows.sum()):
             taken[label] = answer
     if set(taken) != set(taken.values()):
         taken = {}

@@ -33,8 +33,6 @@ from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 from retwin.scores.segments import median_error_trajectory
 from retwin.scores.uses import error_of
 
-SEGMENTS = 10
-"""Number of segments below which no range of them is shown."""
 BAR = 0.38
 """Width of a bar; groups of bars are 1 apart."""
 
@@ -124,10 +122,11 @@ def _row(
     low, high = np.quantile(single, [0.05, 0.95])
     mean = float(means.mean())
     digits = places([mean, low, high])
+    # Number of segments below which no range of them is shown.
     texts = [
         number(mean, digits),
         span(ends, digits),
-        span((low, high) if total >= SEGMENTS else None, digits),
+        span((low, high) if total >= 10 else None, digits),
         number(generated, digits),
     ]
     return [text if text == "–" else behind(text, unit) for text in texts], total

@@ -20,8 +20,6 @@ MATERIAL = 0.1
 """Correlation of residuals below which it changes hardly anything, however sure it is."""
 SENTENCES = 4
 """Outputs that have a sentence of their own, at most."""
-SMALL = 0.02
-"""Ratio of errors below which a change in percent has decimals."""
 OWN_START = "mean of the records"
 """What a start is of which each record has its own."""
 
@@ -96,7 +94,8 @@ def change(error: RMSError, *, interval: bool = True) -> str:
 
 def percent(ratio: float) -> str:
     """`−86` for a ratio of 0.14; with two decimals where little is left."""
-    return f"{100 * (ratio - 1):+.{2 if ratio < SMALL else 0}f}".replace("-", "−")
+    # Ratio of errors below which a change in percent has decimals.
+    return f"{100 * (ratio - 1):+.{2 if ratio < 0.02 else 0}f}".replace("-", "−")
 
 
 def interval_remark(found: Identification) -> str:

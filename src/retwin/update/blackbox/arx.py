@@ -30,9 +30,6 @@ from retwin.update.blackbox.lags import Lags, least_squares
 from retwin.update.dynamics.estimation import Point
 from retwin.update.dynamics.unknowns import coefficients_of
 
-START = 10.0
-"""Bound of the states at the first sample, over their largest value at rest."""
-
 
 def fit_arx(observed: Trajectories, seed: int, progress: Progress | None) -> estimate.BlackBox:
     """The linear model of the order that predicts held-out blocks best; it needs no seed."""
@@ -110,7 +107,8 @@ class Linear:
             return tuple(following)
 
         starts = self.starts(theta)
-        bound = START * (1.0 + float(np.abs(starts).max()))
+        # Bound of the states at the first sample, over their largest value at rest.
+        bound = 10.0 * (1.0 + float(np.abs(starts).max()))
         terms = [each.name for each in self.lags.terms]
         names = [f"{own}: {term}" for own in observed.outputs.names for term in terms]
         channels = observed.inputs, observed.outputs, observed.rate

@@ -24,10 +24,6 @@ from retwin.update.corrections.delay_range import checked_range, range_in_sample
 from retwin.update.corrections.delays import at_bound, first_delays, within
 from retwin.update.kernels.generation import delayed_path
 
-ROUNDS = 5
-"""Times that the noise is estimated anew, and z with it."""
-TRAJECTORIES_PER_BATCH = 128
-"""Trajectories inferred together, which bounds memory."""
 WIDE = 100.0
 """Standard deviation of the prior, in the largest plausible value: it decides only what was not
 measured at all."""
@@ -105,9 +101,10 @@ class DelayOffset:
         `Context.unit`, and of a sample the outputs that were measured count.
         """
         limits = range_in_samples(self.delay_range, context, observed, mask)
+        # Trajectories inferred together, which bounds memory.
         parts = [
             self._infer(context[some], observed[some], mask[some], limits)
-            for some in torch.arange(len(context)).split(TRAJECTORIES_PER_BATCH)
+            for some in torch.arange(len(context)).split(128)
         ]
         names = ("z", "covariance", "identified", "noise", "at_bound")
         columns: dict[str, Any] = {
@@ -134,7 +131,8 @@ class DelayOffset:
         # A fast motion half a sample beside the grid is beyond the cutoff of Tukey's loss, and the
         # rounding of the few samples that count would decide where its delay goes from there.
         noise = replace(noise, loss=StudentT())
-        for _ in range(ROUNDS):
+        # Times that the noise is estimated anew, and z with it.
+        for _ in range(5):
             solution = solve(problem, prior, noise, x, bounds=problem.bounds, reweightings=1)
             x = solution.x
             noise, prior = _learned(problem, problem.residual(x))

@@ -20,8 +20,6 @@ from retwin.data.segments import Segments
 from retwin.update.corrections.delays import gather_samples
 from retwin.update.kernels.generation import joined_samples
 
-ROUNDING = 1e-6
-"""Difference from a whole number of time steps that is only the rounding of numbers."""
 REGULAR, GROSS = 0.9, 30.0
 """A value is a glitch if its error is `GROSS` times this quantile of all errors."""
 LEVELS = np.linspace(0, 1, 33)
@@ -91,7 +89,8 @@ class SampledSensor:
         expected, remedy = "one whose timing is known", "call timed or fitted first"
         period = given("sensor", self.period, expected, got=repr(self), remedy=remedy)
         every = round(period * rate)
-        whole = every >= 1 and abs(period * rate - every) <= ROUNDING
+        # Difference from a whole number of time steps that is only the rounding of numbers.
+        whole = every >= 1 and abs(period * rate - every) <= 1e-6
         expected = f"a whole number of time steps of {1 / rate:g} s"
         remedy = "leave it out: it is fitted from data"
         require(whole, "sensor.period", expected=expected, got=f"{period:g} s", remedy=remedy)

@@ -22,9 +22,6 @@ from retwin.update.piecewise_linear import TOLERANCE
 SOURCES = ("network.c", "pieces.c", "warp.c", "linearised.c")
 OUTPUTS = 6
 """Outputs of a layer that are computed together, as in `network.c`."""
-DENSITY = 3.0
-"""Points of a ramp per standard deviation of the commands that it covers, beyond five; too few are
-found out, and cost a second evaluation. With 3 the default network of the arm takes least time."""
 
 
 def library() -> ctypes.CDLL | None:
@@ -40,7 +37,10 @@ def along_pieces(surrogate: Any, commands: NDArray) -> NDArray | None:
         return None
     values = np.ascontiguousarray(commands, np.float32)
     out = np.empty((*values.shape[:2], len(packed[2])), np.float32)
-    call(kernel, "pieces", values.shape[:2], DENSITY, packed, (values, out))
+    # Points of a ramp per standard deviation of the commands that it covers, beyond five; too few
+    # are found out, and cost a second evaluation. With 3 the default network of the arm takes least
+    # time.
+    call(kernel, "pieces", values.shape[:2], 3.0, packed, (values, out))
     return out
 
 
