@@ -9,7 +9,6 @@ Whether an actuator missed a segment is decided by comparing evidence.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -396,10 +395,7 @@ def _odds(problem: CommandProblem, assumed: tuple[float, float]) -> Tensor:
 
 
 def _predict_runs(
-    problem: CommandProblem,
-    design: Design,
-    draws: Sequence[Hierarchy],
-    assumed: tuple[float, float],
+    problem: CommandProblem, design: Design, draws: list[Hierarchy], assumed: tuple[float, float]
 ) -> Tensor | None:
     """Draws (J, M, 1 + 2 d_u) of z in further runs, under conditions that were not seen.
 
