@@ -21,9 +21,8 @@ from retwin.diagnosis.inversion.fitting import lower_bound
 from retwin.diagnosis.inversion.hypotheses import stuck_pairs
 from retwin.diagnosis.inversion.severity import draw_biases
 from retwin.diagnosis.inversion.trajectories import UNEXPLAINED
-from retwin.inference.losses import StudentT
-from retwin.inference.noise import Noise
-from retwin.inference.priors import GaussianPrior
+from retwin.inference.noise import Noise, StudentT
+from retwin.inference.problem import GaussianPrior
 from retwin.nets.training import Training
 from retwin.scores.classification import score
 from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject

@@ -12,9 +12,8 @@ from scipy.stats import multivariate_normal, multivariate_t, norm
 from torch import Tensor
 
 from retwin.inference import solver
-from retwin.inference.losses import StudentT, Tukey
-from retwin.inference.noise import Noise, common_rounding, correlation_time
-from retwin.inference.priors import GaussianPrior
+from retwin.inference.noise import Noise, StudentT, Tukey, common_rounding, correlation_time
+from retwin.inference.problem import GaussianPrior
 from retwin.inference.solver import Bounds, Solution, added_evidence, best_per_row, solve
 
 pytestmark = pytest.mark.numerical

@@ -22,9 +22,8 @@ from torch import Tensor
 import retwin as rt
 from retwin.diagnosis.inversion.hypotheses import Hypotheses
 from retwin.diagnosis.inversion.trajectories import Inversion, invert
-from retwin.inference.losses import Tukey
-from retwin.inference.noise import Noise
-from retwin.inference.priors import GaussianPrior
+from retwin.inference.noise import Noise, Tukey
+from retwin.inference.problem import GaussianPrior
 from retwin.inference.solver import Solution, solve
 from retwin.update.corrections.commands.missed_segments import fitted
 from retwin.update.corrections.commands.offset_features import WIDE

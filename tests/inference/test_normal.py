@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 
 from retwin.inference import normal
-from retwin.inference.losses import Tukey
-from retwin.inference.noise import Noise
-from retwin.inference.priors import GaussianPrior
-from retwin.inference.problem import CommonError
+from retwin.inference.noise import Noise, Tukey
+from retwin.inference.problem import CommonError, GaussianPrior
 from retwin.inference.solver import Bounds, GaussNewtonStep, gauss_newton_step
 
 pytestmark = pytest.mark.skipif(normal.library() is None, reason="there is no C compiler")

@@ -15,9 +15,8 @@ from retwin.report.figures.figure import Axis, Band, Figure, Line, Matrices, Mat
 from retwin.report.figures.plotly_specs import panel_spec
 from retwin.report.figures.png import draw, png
 from retwin.report.sections import SECTIONS, sections_of
-from retwin.report.sections.discrepancy import latents
+from retwin.report.sections.discrepancy import latents, segment
 from retwin.report.sections.fidelity import fidelity
-from retwin.report.sections.segment import segment
 from retwin.report.study import Study
 from retwin.results import Results
 

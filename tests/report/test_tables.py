@@ -13,9 +13,8 @@ from retwin.data.quality.finding import Finding
 from retwin.evaluation.choice.fitted import CandidateScore
 from retwin.report.blocks import Cell, Column, Table
 from retwin.report.choice import comparison_table
-from retwin.report.glossary import explained
 from retwin.report.labels import distinct, learned_name, percent, percents
-from retwin.report.page import DOCS
+from retwin.report.page import DOCS, explained
 from retwin.report.records import finding_rows
 
 

@@ -37,13 +37,10 @@ def save(
 
     check_place(out, folder=True, holds=("model.json", SUMS, "twin", "guard", "diagnoser"))
     twin = updated_twin(model)
-    require(
-        isinstance(twin, rt.CorrectedTwin),
-        "MODEL",
-        expected="a corrected surrogate, of `retwin fit`",
-        got=f"corrected dynamics, {model}",
-        remedy="fit without --dynamics, or make an FMU of it: retwin export fmu",
-    )
+    expected = "a corrected surrogate, of `retwin fit`"
+    got = f"corrected dynamics, {model}"
+    remedy = "fit without --dynamics, or make an FMU of it: retwin export fmu"
+    require(isinstance(twin, rt.CorrectedTwin), "MODEL", expected=expected, got=got, remedy=remedy)
     system = rt.cases.get(case or twin.case)
     classifier = None if diagnoser is None else rt.load_diagnoser(diagnoser)
     calibration = read(real, system, part="calibration", max_bytes=max_bytes, mapping=mapping)

@@ -13,23 +13,9 @@ from rich.table import Table
 
 from retwin.catalog import DOWNLOADS
 from retwin.checks import at_least, ends_in, given
+from retwin.cli import options
 from retwin.cli.commands import Commands
-from retwin.cli.options import (
-    CaseOption,
-    Inputs,
-    Json,
-    LogMapping,
-    MaxBytes,
-    Outputs,
-    Rate,
-    Seed,
-    argument,
-    case_option,
-    channel_names,
-    leave_out,
-    option,
-    rare,
-)
+from retwin.cli.options import argument, leave_out, option, rare
 from retwin.cli.reading import case_named, data_case, read, shown_records
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
@@ -56,7 +42,9 @@ app = Commands(
 
 ChannelsOf = Annotated[
     str | None,
-    case_option(help="Case or twin with the channels: case.toml, plant.fmu, module:function, …"),
+    options.case_option(
+        help="Case or twin with the channels: case.toml, plant.fmu, module:function, …"
+    ),
 ]
 
 
@@ -64,12 +52,12 @@ ChannelsOf = Annotated[
 def info(
     files: Annotated[list[Path], argument("FILES", "Files or folders of trajectories.")],
     case: ChannelsOf = None,
-    rate: Rate = None,
-    mapping: LogMapping = None,
-    inputs: Inputs = "",
-    outputs: Outputs = "",
-    max_bytes: MaxBytes = None,
-    as_json: Json = False,
+    rate: options.Rate = None,
+    mapping: options.LogMapping = None,
+    inputs: options.Inputs = "",
+    outputs: options.Outputs = "",
+    max_bytes: options.MaxBytes = None,
+    as_json: options.Json = False,
 ) -> None:
     """Describe files: classes, samples, channels, missing values, SHA-256."""
     rate_of = None
@@ -97,10 +85,10 @@ def map_log(
     rate: Annotated[
         float | None, rare("HZ", "Rows per second, if it has no times.", "--rate")
     ] = None,
-    inputs: Inputs = "",
-    outputs: Outputs = "",
-    max_bytes: MaxBytes = None,
-    as_json: Json = False,
+    inputs: options.Inputs = "",
+    outputs: options.Outputs = "",
+    max_bytes: options.MaxBytes = None,
+    as_json: options.Json = False,
 ) -> None:
     """Propose what a log's signals stand for, and draw it with the trajectories they make."""
     from retwin.data.logs.mapped import try_mapping
@@ -165,11 +153,11 @@ def convert(
     split: Annotated[
         float | None, option("SHARE", "Of each class to OUT; the rest goes to OUT-rest.")
     ] = None,
-    seed: Seed = 0,
-    case: CaseOption = None,
-    rate: Rate = None,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
+    seed: options.Seed = 0,
+    case: options.CaseOption = None,
+    rate: options.Rate = None,
+    mapping: options.LogMapping = None,
+    max_bytes: options.MaxBytes = None,
 ) -> None:
     """Write trajectories in retwin's own format, with channels, rate and provenance.
 
@@ -204,10 +192,10 @@ def _channels_of(
     `rate_of` gives the sample rate of channels in a log, for a twin that has none of its own.
     """
     if name is None:
-        options = {"--inputs": inputs or None, "--outputs": outputs or None}
-        leave_out(options, "without --case, the twin to which they belong")
+        channels = {"--inputs": inputs or None, "--outputs": outputs or None}
+        leave_out(channels, "without --case, the twin to which they belong")
         return None
-    names = (channel_names(inputs), channel_names(outputs))
+    names = (options.channel_names(inputs), options.channel_names(outputs))
     if Path(name).suffix.lower() not in FILES and ":" not in name and not any(names):
         return data_case(name) if rate_of is None else case_named(name)
     from retwin.cases.twin_data import log_case

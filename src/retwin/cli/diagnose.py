@@ -14,17 +14,9 @@ from numpy.typing import NDArray
 
 from retwin import catalog
 from retwin.checks import given, one_of
+from retwin.cli import options
 from retwin.cli.commands import Commands
-from retwin.cli.options import (
-    CaseOption,
-    Json,
-    LogMapping,
-    MaxBytes,
-    Seed,
-    argument,
-    leave_out,
-    option,
-)
+from retwin.cli.options import argument, leave_out, option
 from retwin.cli.reading import (
     case_named,
     is_sealed,
@@ -69,14 +61,14 @@ def fit(
     classifier: Annotated[
         str | None, option("NAME", "cnn, lstm or rocket; else cnn.", names=catalog.CLASSIFIERS)
     ] = None,
-    case: CaseOption = None,
+    case: options.CaseOption = None,
     rate: Annotated[float | None, option("HZ", "Sample rate of a classifier's features.")] = None,
     random_onset: Annotated[
         bool, option("", "With --from: infer the onset of stuck motors.", "--random-onset")
     ] = False,
-    seed: Seed = 0,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
+    seed: options.Seed = 0,
+    mapping: options.LogMapping = None,
+    max_bytes: options.MaxBytes = None,
 ) -> None:
     """Train a diagnoser on labelled trajectories, or derive one from a corrected twin."""
     parts = ("surrogate", "residual", "twin") if model else ()
@@ -139,14 +131,14 @@ def _invert(
 def predict(
     model: Annotated[Path, argument("MODEL", "A diagnoser, a bundle, or its ONNX export.")],
     file: Annotated[Path, argument("FILE", "Trajectories; labels are not needed.")],
-    case: CaseOption = None,
+    case: options.CaseOption = None,
     out: Annotated[Path | None, option("FILE", "CSV file for all probabilities.", "--out")] = None,
     max_faults: Annotated[
         int, option("N", "2 also tries pairs of stuck actuators.", "--max-faults")
     ] = 1,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
-    as_json: Json = False,
+    mapping: options.LogMapping = None,
+    max_bytes: options.MaxBytes = None,
+    as_json: options.Json = False,
 ) -> None:
     """Diagnose trajectories, and score the diagnoses if the labels are known.
 

@@ -6,17 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from retwin.checks import require
+from retwin.cli import options
 from retwin.cli.commands import Commands
-from retwin.cli.options import (
-    Json,
-    OtherCase,
-    Seed,
-    argument,
-    channel_names,
-    leave_out,
-    option,
-    rare,
-)
+from retwin.cli.options import argument, leave_out, option, rare
 from retwin.cli.reading import saved, system_of, updated_twin
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.errors import InputError
@@ -28,8 +20,6 @@ if TYPE_CHECKING:
     from retwin.deploy.actuator.export import ExportedActuator
     from retwin.deploy.actuator.torque_net import Joint
 
-TRAJECTORIES = 256
-"""Trajectories of the case's sampler at whose segments z is drawn, or whose torques are learned."""
 
 app = Commands(
     help="Take an updated twin to other tools.",
@@ -45,8 +35,8 @@ def fmu(
     source_only: Annotated[
         bool, rare("", "Write no binary for this machine.", "--source-only")
     ] = False,
-    case: OtherCase = None,
-    as_json: Json = False,
+    case: options.OtherCase = None,
+    as_json: options.Json = False,
 ) -> None:
     """Write an updated twin as an FMU with C source code inside."""
     from retwin.deploy.fmu.export import export_fmu
@@ -85,7 +75,7 @@ def fmu(
 def onnx(
     folder: Annotated[Path, argument("BUNDLE", "Folder of a bundle, of retwin bundle save.")],
     out: Annotated[Path, option("FOLDER", "Where to put the ONNX graphs.")],
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> None:
     """Write a bundle as ONNX graphs, with which `diagnose predict` needs no torch."""
     from retwin.deploy.bundle.bundle import Bundle
@@ -123,9 +113,9 @@ def actuator(
         ),
     ] = None,
     history: Annotated[str | None, rare("STEPS", "Of --torque, into the past; else 0,1,2.")] = None,
-    case: OtherCase = None,
-    seed: Seed = 0,
-    as_json: Json = False,
+    case: options.OtherCase = None,
+    seed: options.Seed = 0,
+    as_json: options.Json = False,
 ) -> None:
     """Write what the actuators execute, for many simulated robots at once.
 
@@ -184,15 +174,12 @@ def _joint(text: str) -> Joint:
     """The channels in a value of --torque."""
     from retwin.deploy.actuator.torque_net import Joint
 
-    names = channel_names(text)
-    require(
-        len(names) in (3, 4) and len(names) == text.count(",") + 1,
-        "--torque",
-        expected="TARGET,POSITION,TORQUE or TARGET,POSITION,TORQUE,VELOCITY",
-        got=repr(text),
-        remedy="name a command and two or three outputs of the twin; `retwin data info` of its "
-        "calibration data lists them",
-    )
+    names = options.channel_names(text)
+    complete = len(names) in (3, 4) and len(names) == text.count(",") + 1
+    expected = "TARGET,POSITION,TORQUE or TARGET,POSITION,TORQUE,VELOCITY"
+    remedy = "name a command and two or three outputs of the twin; `retwin data info` of its "
+    remedy += "calibration data lists them"
+    require(complete, "--torque", expected=expected, got=repr(text), remedy=remedy)
     return Joint(*names)
 
 
@@ -201,12 +188,9 @@ def _steps(text: str) -> tuple[int, ...]:
     try:
         return tuple(int(each) for each in text.split(","))
     except ValueError:
-        raise InputError(
-            "--history",
-            expected="whole numbers of steps, joined by commas",
-            got=repr(text),
-            remedy="give --history 0,1,2",
-        ) from None
+        expected = "whole numbers of steps, joined by commas"
+        remedy = "give --history 0,1,2"
+        raise InputError("--history", expected=expected, got=repr(text), remedy=remedy) from None
 
 
 def _print_actuator(made: ExportedActuator, out: Path, *, as_json: bool) -> None:
@@ -239,4 +223,5 @@ def _sampled(twin: Any, model: Path, case: str | None, seed: int) -> NDArray:
     import numpy as np
 
     sampler = system_of(twin, model, case).sampler
-    return sampler.sample(TRAJECTORIES, rng=np.random.default_rng(seed))
+    # Trajectories of the case's sampler at whose segments z is drawn, or whose torques are learned.
+    return sampler.sample(256, rng=np.random.default_rng(seed))

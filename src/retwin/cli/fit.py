@@ -9,17 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from retwin import catalog
 from retwin.checks import given, one_of, require
-from retwin.cli.options import (
-    CaseArgument,
-    Horizon,
-    Json,
-    LogMapping,
-    MaxBytes,
-    Seed,
-    option,
-    rare,
-    seconds_of,
-)
+from retwin.cli import options
+from retwin.cli.options import option, rare
 from retwin.cli.reading import read, shown_records, stored_name
 from retwin.cli.terminal import Interrupted, answer, bar, note, table
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -41,8 +32,7 @@ Correction = Annotated[
 ]
 Compare = Annotated[bool, rare("", "Compare candidates.", "--compare/--no-compare")]
 Yardstick = Annotated[
-    bool | None,
-    rare("", "Add models without a twin.", "--yardstick/--no-yardstick"),
+    bool | None, rare("", "Add models without a twin.", "--yardstick/--no-yardstick")
 ]
 TwinSet = Annotated[Path | None, rare("FILE", "Trajectories of the twin; else simulated.")]
 Simulations = Annotated[int | None, rare("N", "Trajectories simulated; else the case's.")]
@@ -53,24 +43,23 @@ Network = Annotated[
     rare("NAME", "Of a surrogate: mlp, lstm, tcn or state_space.", names=catalog.NETWORKS),
 ]
 Density = Annotated[
-    str | None,
-    rare("NAME", "mixture, flow or sequence_mixture.", names=catalog.DENSITIES),
+    str | None, rare("NAME", "mixture, flow or sequence_mixture.", names=catalog.DENSITIES)
 ]
 Prior = Annotated[list[Path] | None, option("FOLDER", "Models of other such machines.")]
 Refine = Annotated[bool, rare("", "Fine-tune on outputs afterwards.", "--refine")]
 
 
 def fit(
-    case: CaseArgument,
+    case: options.CaseArgument,
     real: RealSet,
     out: ModelFolder,
-    horizon: Horizon = "free",
+    horizon: options.Horizon = "free",
     dynamics: StateEquations = False,
     correction: Correction = None,
     prior: Prior = None,
-    mapping: LogMapping = None,
-    seed: Seed = 0,
-    as_json: Json = False,
+    mapping: options.LogMapping = None,
+    seed: options.Seed = 0,
+    as_json: options.Json = False,
     compare: Compare = True,
     yardstick: Yardstick = None,
     surrogate: SurrogateMode = "auto",
@@ -80,7 +69,7 @@ def fit(
     network: Network = None,
     density: Density = None,
     refine: Refine = False,
-    max_bytes: MaxBytes = None,
+    max_bytes: options.MaxBytes = None,
 ) -> None:
     """Update a twin by real records; save the updated twin.
 
@@ -95,7 +84,7 @@ def fit(
     from retwin.update.residual.priors import other_machines
 
     check_place(out, folder=True, holds=HOLDS)
-    seconds = seconds_of("--horizon", horizon)
+    seconds = options.seconds_of("--horizon", horizon)
     one_of("--surrogate", surrogate, catalog.SURROGATE_MODES)
     require(
         not dynamics or (correction is network is twin_data is None and calibrate_on == "healthy"),
@@ -110,13 +99,10 @@ def fit(
     measured = _labelled(system, measured)
     faults = system.faults if calibrate_on == "all" else calibrate_on
     calibrating(measured, faults)  # before a surrogate is trained, which takes minutes
-    require(
-        compare or system.diagnosed or dynamics or correction is not None,
-        "--no-compare",
-        expected="--dynamics or --correction with it, or a case with classes, whose own is taken",
-        got="neither",
-        remedy="name a method, or let the candidates be compared",
-    )
+    decided = compare or system.diagnosed or dynamics or correction is not None
+    expected = "--dynamics or --correction with it, or a case with classes, whose own is taken"
+    remedy = "name a method, or let the candidates be compared"
+    require(decided, "--no-compare", expected=expected, got="neither", remedy=remedy)
     forced = system.diagnosed or correction is not None or not compare or faults != "healthy"
     method = "dynamics" if dynamics else _own(system) if forced else ""
     trained = system.diagnosed or refine or any((network, twin_data, simulations))

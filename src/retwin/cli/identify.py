@@ -9,20 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from retwin import catalog
 from retwin.checks import existing, one_of, require
-from retwin.cli.completion import complete_twins
-from retwin.cli.options import (
-    Inputs,
-    Json,
-    LogMapping,
-    MaxBytes,
-    Outputs,
-    Seed,
-    argument,
-    channel_names,
-    option,
-    rare,
-    seconds_of,
-)
+from retwin.cli import options
+from retwin.cli.options import argument, complete_twins, option, rare
 from retwin.cli.reading import log_reader, shown_records
 from retwin.cli.terminal import answer, bar, command_given, note, table
 from retwin.serialisation.places import check_place
@@ -41,12 +29,7 @@ UNRATED = (".fmu", ".xml", ".urdf")
 
 
 TwinName = Annotated[
-    str,
-    argument(
-        "TWIN",
-        "*.fmu, *.xml, module:object, or a case.",
-        autocompletion=complete_twins,
-    ),
+    str, argument("TWIN", "*.fmu, *.xml, module:object, or a case.", autocompletion=complete_twins)
 ]
 LogFiles = Annotated[list[Path], argument("LOG…", "Tables *.csv, or what rt.load reads.")]
 Out = Annotated[Path, option("FOLDER", "Where the results go.")]
@@ -61,13 +44,7 @@ HoldOut = Annotated[float | None, option("X", "Share held out; else 0.25.")]
 Loss = Annotated[str | None, rare("NAME", "soft_l1 (default), linear or cauchy.")]
 Starts = Annotated[int | None, rare("N", "Starts of the search; else 4.", min=1, max=1000)]
 SensorRate = Annotated[float | None, rare("HZ", "True rate of the sensor, if lower.")]
-Horizon = Annotated[
-    str,
-    rare(
-        "SECONDS",
-        "Windows to predict, or free.",
-    ),
-]
+Horizon = Annotated[str, rare("SECONDS", "Windows to predict, or free.")]
 Processes = Annotated[int, rare("N", "Worker processes.", min=1, max=256)]
 Column = Annotated[list[str] | None, rare("CHANNEL=NAME", "Column of a channel named otherwise.")]
 Time = Annotated[str | None, rare("NAME", "Column of the times; NAME=ms, us, ns, iso.")]
@@ -80,14 +57,14 @@ def identify(
     logs: LogFiles,
     out: Out,
     free: Free = None,
-    inputs: Inputs = "",
-    outputs: Outputs = "",
+    inputs: options.Inputs = "",
+    outputs: options.Outputs = "",
     rate: Rate = None,
-    mapping: LogMapping = None,
+    mapping: options.LogMapping = None,
     method: MethodName = "least_squares",
     hold_out: HoldOut = None,
-    seed: Seed = 0,
-    as_json: Json = False,
+    seed: options.Seed = 0,
+    as_json: options.Json = False,
     column: Column = None,
     time: Time = None,
     transient: Transient = 0.0,
@@ -96,7 +73,7 @@ def identify(
     starts: Starts = None,
     sensor_rate: SensorRate = None,
     processes: Processes = 1,
-    max_bytes: MaxBytes = None,
+    max_bytes: options.MaxBytes = None,
 ) -> None:
     """Identify the parameters of your twin from logs.
 
@@ -114,9 +91,9 @@ def identify(
     check_place(out, folder=True, holds=HOLDS)
     settings = _method(method, loss, starts)
     # Free is an infinite horizon, and none is one that is chosen.
-    ahead = {"horizon": seconds_of("--horizon", horizon) or inf} if horizon else {}
+    ahead = {"horizon": options.seconds_of("--horizon", horizon) or inf} if horizon else {}
     columns = replace(_columns(column, time, transient), mapping=mapping)
-    names = [channel_names(each) for each in (inputs, outputs)]
+    names = [options.channel_names(each) for each in (inputs, outputs)]
     for log in logs:
         joined = "check the name; several names after an option are joined by commas: a,b"
         existing("LOG", log, log.exists(), remedy=joined)
@@ -204,22 +181,20 @@ def _method(name: str, loss: str | None, starts: int | None) -> Any:
     from retwin.update.identification.search import Loss as Losses
 
     one_of("--method", name, catalog.IDENTIFICATIONS)
-    options: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     if loss is not None:
-        options["loss"] = one_of("--loss", loss, get_args(Losses))
+        settings["loss"] = one_of("--loss", loss, get_args(Losses))
     if starts is not None:
-        options["starts"] = starts
+        settings["starts"] = starts
     taken = {"least_squares": ("loss", "starts"), "evolution": ("loss",), "bayes": ("starts",)}
-    for given in options:
+    for given in settings:
         methods = [each for each, names in taken.items() if given in names]
+        expected = f"none with --method {name}"
+        remedy = f"leave it out; {' and '.join(methods)} take it"
         require(
-            name in methods,
-            f"--{given}",
-            expected=f"none with --method {name}",
-            got=options[given],
-            remedy=f"leave it out; {' and '.join(methods)} take it",
+            name in methods, f"--{given}", expected=expected, got=settings[given], remedy=remedy
         )
-    return catalog.resolve(catalog.IDENTIFICATIONS[name].target)(**options)
+    return catalog.resolve(catalog.IDENTIFICATIONS[name].target)(**settings)
 
 
 def _columns(column: list[str] | None, time: str | None, transient: float) -> Columns:
@@ -230,13 +205,10 @@ def _columns(column: list[str] | None, time: str | None, transient: float) -> Co
     names = {}
     for text in column or ():
         channel, _, name = text.partition("=")
-        require(
-            channel and name and channel not in names,
-            "--column",
-            expected="CHANNEL=COLUMN, each channel once",
-            got=repr(text),
-            remedy="write for instance --column speed=omega_measured",
-        )
+        paired = channel and name and channel not in names
+        expected = "CHANNEL=COLUMN, each channel once"
+        remedy = "write for instance --column speed=omega_measured"
+        require(paired, "--column", expected=expected, got=repr(text), remedy=remedy)
         names[channel] = name
     return Columns(names, time_column(time or "", "--time"), transient)
 

@@ -11,30 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from retwin.checks import require
-from retwin.cli.options import (
-    Horizon,
-    Json,
-    LogMapping,
-    MaxBytes,
-    Model,
-    OtherCase,
-    Seed,
-    WarmUp,
-    argument,
-    leave_out,
-    option,
-    seconds_of,
-)
+from retwin.cli import options, reading
+from retwin.cli.options import argument, leave_out, option
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import (
-    fitted_remarks,
-    read,
-    read_commands,
-    source_of,
-    system_of,
-    unstable_remarks,
-    updated_twin,
-)
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import Trajectories
@@ -56,11 +35,11 @@ def generate(
         bool, option("", "Write mean and 90 % band of --commands, also as *.png.", "--bands")
     ] = False,
     per_class: Annotated[int, option("N", "Trajectories per class.")] = 400,
-    case: OtherCase = None,
-    seed: Seed = 0,
+    case: options.OtherCase = None,
+    seed: options.Seed = 0,
     workers: Workers = None,
-    warm_up: WarmUp = "",
-    mapping: LogMapping = None,
+    warm_up: options.WarmUp = "",
+    mapping: options.LogMapping = None,
 ) -> None:
     """Generate trajectories, or predictions of commands.
 
@@ -69,26 +48,24 @@ def generate(
     """
     import retwin as rt
 
-    require(
-        not bands or (commands is not None and out.suffix.lower() == ".csv"),
-        "--bands",
-        expected="--commands FILE and --out FILE.csv",
-        got=f"--commands {commands}, --out {out}",
-        remedy="bands are those of given commands",
-    )
-    for text in unstable_remarks(model):
+    possible = not bands or (commands is not None and out.suffix.lower() == ".csv")
+    expected = "--commands FILE and --out FILE.csv"
+    got = f"--commands {commands}, --out {out}"
+    remedy = "bands are those of given commands"
+    require(possible, "--bands", expected=expected, got=got, remedy=remedy)
+    for text in reading.unstable_remarks(model):
         note(text)
     if bands:
         check_place(out)
         check_place(out.with_suffix(".png"))
-        begin = seconds_of("--warm-up", warm_up or "free") or 0.0
+        begin = options.seconds_of("--warm-up", warm_up or "free") or 0.0
         _write_bands(model, commands, out, case, seed, mapping, begin)  # type: ignore[arg-type]
         return
     leave_out({"--warm-up": warm_up or None}, "without --bands")
     kind = check_target(out)
-    updated, system = source_of(model, case)
+    updated, system = reading.source_of(model, case)
     if commands is not None:
-        records = read_commands(commands, system, mapping=mapping)
+        records = reading.read_commands(commands, system, mapping=mapping)
         rt.save(updated.simulate(records.commands.astype(float), seed=seed), out)
         note(f"Wrote {len(records)} trajectories to {out}")
         return
@@ -119,8 +96,8 @@ def _write_bands(
     from retwin.report.choice.page import draw_prediction
     from retwin.report.figures.png import png
 
-    updated, system = source_of(model, case)
-    records = read_commands(commands, system, mapping=mapping)
+    updated, system = reading.source_of(model, case)
+    records = reading.read_commands(commands, system, mapping=mapping)
     _note_start(updated, records, begin)
     found = predict_records(updated, records, started=begin, seed=seed)
     write_predictions(found, records, out)
@@ -150,38 +127,32 @@ def write_predictions(found: ScoredPrediction, records: Trajectories, out: Path)
 
 
 def evaluate(
-    model: Model,
+    model: options.Model,
     real: Annotated[list[Path], option("FILE", "Records it was not fitted to; may be repeated.")],
-    horizon: Horizon = "free",
-    warm_up: WarmUp = "",
+    horizon: options.Horizon = "free",
+    warm_up: options.WarmUp = "",
     out: Annotated[Path | None, option("FILE", "CSV file of predictions with bands.")] = None,
-    case: OtherCase = None,
-    seed: Seed = 0,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
-    as_json: Json = False,
+    case: options.OtherCase = None,
+    seed: options.Seed = 0,
+    mapping: options.LogMapping = None,
+    max_bytes: options.MaxBytes = None,
+    as_json: options.Json = False,
 ) -> None:
     """Score an updated twin on other records."""
     from retwin.evaluation import predict_records, score_model
 
-    ahead = seconds_of("--horizon", horizon)
-    begin = seconds_of("--warm-up", warm_up or "free") or 0.0
+    ahead = options.seconds_of("--horizon", horizon)
+    begin = options.seconds_of("--warm-up", warm_up or "free") or 0.0
     if out is not None:
         check_place(out)
-    updated = updated_twin(model)
-    system = system_of(updated, model, case)
-    records = read(real, system, part="test", max_bytes=max_bytes, mapping=mapping)
+    updated = reading.updated_twin(model)
+    system = reading.system_of(updated, model, case)
+    records = reading.read(real, system, part="test", max_bytes=max_bytes, mapping=mapping)
     if begin:
         _note_start(updated, records, begin)
-    unstable = [] if ahead else unstable_remarks(model)
+    unstable = [] if ahead else reading.unstable_remarks(model)
     scores = score_model(
-        updated,
-        records,
-        horizon=ahead,
-        warm_up=begin,
-        started=begin,
-        twin=system.twin,
-        seed=seed,
+        updated, records, horizon=ahead, warm_up=begin, started=begin, twin=system.twin, seed=seed
     )
     if out is not None:
         found = predict_records(updated, records, horizon=ahead, started=begin, seed=seed)
@@ -210,7 +181,7 @@ def evaluate(
         table(heads, rows, numbers=heads[2:6]),
         *unstable,
         *_verdict(scores, started=bool(begin)),
-        *fitted_remarks(model, records, "these are no scores of new ones"),
+        *reading.fitted_remarks(model, records, "these are no scores of new ones"),
         *begins,
         as_json=as_json,
     )
@@ -239,11 +210,7 @@ def _begin_of(records: Trajectories) -> float:
 
 
 def _start_remarks(
-    model: Twin,
-    records: Trajectories,
-    usual: list[ModelScore],
-    units: dict[str, str],
-    seed: int,
+    model: Twin, records: Trajectories, usual: list[ModelScore], units: dict[str, str], seed: int
 ) -> list[str]:
     """Outputs that are predicted much better from starts that the records themselves give."""
     from retwin.evaluation import score_model
@@ -255,10 +222,11 @@ def _start_remarks(
     if not records.mask[:, : round(begin * records.rate)].any(axis=(1, 2)).all():
         return []  # of some nothing was measured there
     better = score_model(model, records, warm_up=begin, started=begin, seed=seed)
+    # Ratio of errors from which starts of records are named.
     found = [
         f"{b.rmse:.4g} in place of {a.rmse:.4g} {units[a.output]} ({a.output})"
         for a, b in zip((each for each in usual if each.who == "model"), better, strict=False)
-        if b.rmse < MUCH * a.rmse
+        if b.rmse < 0.8 * a.rmse
     ]
     if not found:
         return []
@@ -269,19 +237,12 @@ def _start_remarks(
     ]
 
 
-MUCH = 0.8
 """Ratio of errors from which starts of records are named."""
-HARDLY = 0.02
-"""Part of an error by which an update must lower it, not to be called one of bands alone."""
 FOREIGN, NOTHING = 2.0, 0.05
 """Ratio of the error to the spread of a record from which, and share inside the band below which, a
 record may be of another channel or machine."""
-NO_CHANCE = 3.0
-"""Ratio of the error to that of the band from which on a machine differs from the calibration."""
 START = ", or begin in other states, which --warm-up infers"
 """What else may be the reason where starts are not inferred."""
-CLEAR = 0.01
-"""Part of an error by which another predictor must be better to be mentioned."""
 
 
 def _foreign(scores: list[ModelScore]) -> list[str]:
@@ -296,8 +257,15 @@ def _foreign(scores: list[ModelScore]) -> list[str]:
     ]
 
 
-def _verdict(scores: list[ModelScore], *, started: bool = False) -> list[str]:
-    """What is better than the model, and whether its bands hold, in sentences."""
+def _verdict(scores: list[ModelScore], *, started: bool = False, hardly: float = 0.02) -> list[str]:
+    """What is better than the model, and whether its bands hold, in sentences.
+
+    Parameters
+    ----------
+    hardly : float, default 0.02
+        Part of an error by which an update must lower it, not to be called one of bands alone.
+
+    """
     from retwin.scores.uses import COVERAGE
     from retwin.update.forecast_errors import LEVEL, USUAL
 
@@ -314,20 +282,23 @@ def _verdict(scores: list[ModelScore], *, started: bool = False) -> list[str]:
     for each in (one for one in scores if one.output not in foreign):
         if each.who != "model":
             model = own[each.output]
-            if each.rmse < (1 - CLEAR) * model.rmse:
+            # A hundredth of an error by which another predictor must be better to be mentioned.
+            if each.rmse < 0.99 * model.rmse:
                 made.append(
                     f"{each.output}: {words[each.who]} is a better prediction, by RMSE: "
                     f"{each.rmse:.3g} in place of {model.rmse:.3g}."
                 )
-            elif each.who == "twin" and model.rmse > (1 - HARDLY) * each.rmse and not each.horizon:
+            elif each.who == "twin" and model.rmse > (1 - hardly) * each.rmse and not each.horizon:
                 made.append(
-                    f"{each.output}: the RMSE is that of {words['twin']} within {HARDLY:.0%}: the "
+                    f"{each.output}: the RMSE is that of {words['twin']} within {hardly:.0%}: the "
                     "update adds bands alone there."
                 )
         elif each.coverage < COVERAGE[0]:
             text = f"{each.output}: the 90 % band holds {each.coverage:.0%} of these samples"
             ratio = each.rmse / max(each.width / 2 / USUAL, 1e-300)
-            if ratio > NO_CHANCE:
+            # Ratio of the error to that of the band from which on a machine differs from the
+            # calibration.
+            if ratio > 3.0:
                 made.append(
                     f"{text}, and the RMSE is {ratio:.2g} times what it allows for: this is no "
                     "chance. The machine has changed, as by a fault, or works where the model "

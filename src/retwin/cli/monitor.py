@@ -21,17 +21,9 @@ import typer
 
 from retwin import catalog
 from retwin.checks import at_least, existing, finite, positive, require
+from retwin.cli import options
 from retwin.cli.commands import Commands
-from retwin.cli.options import (
-    Json,
-    LogMapping,
-    MaxBytes,
-    OtherCase,
-    argument,
-    leave_out,
-    option,
-    rare,
-)
+from retwin.cli.options import argument, leave_out, option, rare
 from retwin.cli.reading import (
     case_named,
     fitted_remarks,
@@ -82,8 +74,7 @@ app = Commands(
 @app.command(epilog=example("retwin monitor fit model healthy.npz --out watch"))
 def fit(
     files: Annotated[
-        list[Path],
-        argument("FILE...", "A model, unless there is no twin, and healthy records."),
+        list[Path], argument("FILE...", "A model, unless there is no twin, and healthy records.")
     ],
     out: Annotated[Path, option("FOLDER", "Where to save the monitor.")],
     false_alarms: Annotated[
@@ -92,10 +83,10 @@ def fit(
     lasting: Annotated[
         float | None, option("S", "Time after which an event is a lasting change: 3600.")
     ] = None,
-    case: OtherCase = None,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
-    as_json: Json = False,
+    case: options.OtherCase = None,
+    mapping: options.LogMapping = None,
+    max_bytes: options.MaxBytes = None,
+    as_json: options.Json = False,
 ) -> None:
     """Calibrate a monitor on healthy records, best not those that MODEL was fitted to.
 
@@ -197,10 +188,10 @@ def _describe_visible(visible: Sequence[Visible]) -> list[str]:
 def replay(
     monitor: Annotated[Path, argument("MONITOR", "Folder of a monitor, of retwin monitor fit.")],
     logs: Annotated[list[Path], argument("LOG...", "Records, in the order of time.")],
-    case: OtherCase = None,
-    mapping: LogMapping = None,
-    max_bytes: MaxBytes = None,
-    as_json: Json = False,
+    case: options.OtherCase = None,
+    mapping: options.LogMapping = None,
+    max_bytes: options.MaxBytes = None,
+    as_json: options.Json = False,
 ) -> None:
     """Watch recorded data as if they came now: alarms, their causes, and the promise."""
     from retwin.monitor import Monitor
@@ -381,19 +372,16 @@ def audit(
     store: Annotated[Path, argument("STORE", "Folder of the store, or an exported log.")],
     head: Annotated[str | None, rare("HASH", "A former head that was kept elsewhere.")] = None,
     url: Annotated[str, rare("URL", "The PostgreSQL database, if one.")] = "",
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> None:
     """Verify the log of a store, and the files of its versions."""
     from retwin.monitor import Store, read_log, verify
     from retwin.monitor.versions.registry import damaged
 
-    require(
-        head is None or re.fullmatch("[0-9a-f]{64}", head),
-        "--head",
-        expected="64 hexadecimal digits",
-        got=repr(head)[:80],
-        remedy="give the head that this command printed",
-    )
+    hexadecimal = head is None or re.fullmatch("[0-9a-f]{64}", head)
+    expected = "64 hexadecimal digits"
+    remedy = "give the head that this command printed"
+    require(hexadecimal, "--head", expected=expected, got=repr(head)[:80], remedy=remedy)
     if store.is_file():
         found, reason = verify(read_log(store), head), ""
     else:
@@ -421,7 +409,7 @@ def recalibrate(
         str, option("NAME", "You, if a change that lasts is no fault but the new normal.")
     ] = "",
     url: Annotated[str, rare("URL", "The PostgreSQL database, if one.")] = "",
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> None:
     """Propose a monitor of the last quiet hours, in the shadow of the active one."""
     from retwin.monitor import Store
@@ -461,13 +449,9 @@ def _named(twin: CorrectedTwin | DynamicsTwin | None) -> TwinData | None:
 def _healthy(record: Trajectories, file: Path) -> Trajectories:
     """The healthy trajectories of a file."""
     chosen = record[record.maybe_healthy]
-    require(
-        len(chosen) > 0,
-        str(file),
-        expected="healthy trajectories",
-        got="faulty ones alone",
-        remedy="a monitor is calibrated on the healthy machine",
-    )
+    expected = "healthy trajectories"
+    remedy = "a monitor is calibrated on the healthy machine"
+    require(len(chosen) > 0, str(file), expected=expected, got="faulty ones alone", remedy=remedy)
     return chosen
 
 

@@ -1,9 +1,10 @@
-"""Arguments and options that several commands share."""
+"""Arguments and options that several commands share, and how a shell completes them."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -11,9 +12,54 @@ from typing import Annotated, Any
 
 import typer
 
+from retwin import catalog
 from retwin.catalog import CASES
 from retwin.checks import require, whole
-from retwin.cli.completion import one_of
+
+Complete = Callable[[str], list[str]]
+
+
+def one_of(names: Iterable[str]) -> Complete:
+    """A function that completes to one of these names."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [name for name in names if name.startswith(incomplete)]
+
+    return complete
+
+
+def complete_sources(incomplete: str) -> list[str]:
+    """Complete the last of several names joined by commas; none is offered twice."""
+    *chosen, last = incomplete.split(",")
+    before = "".join(f"{name}," for name in chosen)
+    remaining = [
+        name for name in (*catalog.SOURCES, *(() if chosen else ("all",))) if name not in chosen
+    ]
+    return [before + name for name in remaining if name.startswith(last)]
+
+
+def complete_twins(incomplete: str) -> list[tuple[str, str]]:
+    """Complete to a built-in twin, with its title."""
+    titles = ((name, entry.title) for name, entry in catalog.TWINS.items())
+    return [(name, title) for name, title in titles if name.startswith(incomplete)]
+
+
+def complete_faults(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Complete to a class of the case, or of the twin's own case, that the command names."""
+    # While an option lacks its value, click leaves the arguments in `args`.
+    named = ctx.params.get("case") or ctx.params.get("twin") or next(iter(ctx.args), "")
+    return one_of(("none", "all", *_faults(named)))(incomplete)
+
+
+def _faults(named: str) -> Sequence[str]:
+    if not named.endswith(".toml"):
+        entry = catalog.CASES.get(named.partition("-")[0])
+        return catalog.resolve(entry.recorded).classes if entry else ()
+    try:
+        faults = tomllib.loads(Path(named).read_text("utf-8")).get("faults", {})
+    except (OSError, ValueError):
+        return ()  # the command itself reports what is wrong with the file
+    return ("Healthy", *faults)
 
 
 def option(
@@ -86,8 +132,7 @@ Horizon = Annotated[
 ]
 
 WarmUp = Annotated[
-    str,
-    option("TIME", "Begin of each record that gives its start, not scored: 5s.", "--warm-up"),
+    str, option("TIME", "Begin of each record that gives its start, not scored: 5s.", "--warm-up")
 ]
 
 
@@ -111,13 +156,9 @@ def seconds_of(option: str, text: str) -> float | None:
         return None
     found = re.fullmatch(r"\s*((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-z]*)\s*", text)
     value = float(found[1]) * SECONDS.get(found[2], 0.0) if found else 0.0
-    require(
-        0 < value < inf,
-        option,
-        expected="free, or a time above 0 such as 90s, 15min, 2h or 1d",
-        got=text,
-        remedy="a number alone is in seconds",
-    )
+    expected = "free, or a time above 0 such as 90s, 15min, 2h or 1d"
+    remedy = "a number alone is in seconds"
+    require(0 < value < inf, option, expected=expected, got=text, remedy=remedy)
     return value
 
 

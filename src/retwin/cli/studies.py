@@ -12,8 +12,16 @@ from rich.table import Table
 
 from retwin import catalog
 from retwin.checks import given
-from retwin.cli.completion import complete_sources
-from retwin.cli.options import CaseArgument, Json, LogMapping, Seed, argument, option, rare
+from retwin.cli.options import (
+    CaseArgument,
+    Json,
+    LogMapping,
+    Seed,
+    argument,
+    complete_sources,
+    option,
+    rare,
+)
 from retwin.cli.plans import Scheduler
 from retwin.cli.terminal import answer, bar, command_given, note, plain, resumable, table
 from retwin.progress import FinishedStage
@@ -34,10 +42,6 @@ DEMO_SETTINGS: Any = {
     "overlaid": 1,  # faulty trajectories of each class and fold, which the page shows in full
 }
 """Settings of the plan of the demo."""
-DEMO_EPOCHS = 6
-"""Epochs of the demo's surrogate, whose error is then a tenth of the discrepancy."""
-DEMO_MINUTES = 2
-"""Minutes that a run of the demo takes at most on two cores, as measured."""
 COMPARED = {"a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict"}
 """What is printed of a comparison as JSON."""
 Folds = Annotated[int, option("N", "Folds of --real.")]
@@ -164,10 +168,12 @@ def demo(
     plan = StudyPlan(DEMO, runs=runs, seed=seed, ablations=False, **DEMO_SETTINGS)
     titles = ", ".join(catalog.SOURCES[name].title for name in DEMO)
     kind = "real" if folder else "emulated"
-    minutes = DEMO_MINUTES * plan.number_of_runs
+    # Minutes that a run of the demo takes at most on two cores, as measured.
+    minutes = 2 * plan.number_of_runs
     note(f"Compares on {kind} data, within {minutes} minutes on two quiet cores: {titles}.")
     arm = rt.cases.get("armpi")
-    training = replace(surrogate_training(arm.network), max_epochs=DEMO_EPOCHS)
+    # Epochs of the demo's surrogate, whose error is then a tenth of the discrepancy.
+    training = replace(surrogate_training(arm.network), max_epochs=6)
     _run(replace(arm, training=training), plan, data, target, as_json=as_json)
     note("Next: watch a machine live with retwin monitor run --demo --open;")
     note("or start with a twin and records of your own: retwin identify --help.")

@@ -37,8 +37,6 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 LOG_DELAY = 2.0
 """Seconds before the first line of progress in a log; shorter work leaves none."""
-LEFT_DELAY = 5.0
-"""Seconds before the first time left on a bar; the first steps are no sample of the others."""
 CONTROL = {
     code: f"\\u{code:04x}"
     for code in (*range(32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A))
@@ -143,7 +141,8 @@ class _TimeLeft(ProgressColumn):
     def render(self, task: Task) -> Text:
         elapsed, before = task.elapsed or 0.0, task.fields["before"]
         done, left = task.completed - before, 1.0 - task.completed
-        if elapsed < LEFT_DELAY or done <= 0:
+        # Seconds before the first time left on a bar; the first steps are no sample of the others.
+        if elapsed < 5.0 or done <= 0:
             return Text("-:--:-- left", style="progress.remaining")
         minutes, seconds = divmod(round(elapsed * left / done), 60)
         hours, minutes = divmod(minutes, 60)

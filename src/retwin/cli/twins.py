@@ -1,7 +1,11 @@
-"""`retwin twin`: list, describe and simulate twins, and film what they do."""
+"""`retwin twin`: list, describe and simulate twins, and film what they do.
+
+Films of a trajectory, of `retwin twin simulate --film`: their settings, and the drawing.
+"""
 
 from __future__ import annotations
 
+import re
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,24 +14,12 @@ from retwin import twins
 from retwin.catalog import CASES, TWINS
 from retwin.catalog.modules import known
 from retwin.checks import agree, given, require
+from retwin.cli import options
 from retwin.cli.commands import Commands
-from retwin.cli.completion import complete_faults, complete_twins
-from retwin.cli.films import draw_film, film_settings
-from retwin.cli.options import (
-    Inputs,
-    Json,
-    MaxBytes,
-    Outputs,
-    Seed,
-    argument,
-    channel_names,
-    leave_out,
-    option,
-    rare,
-)
+from retwin.cli.options import argument, complete_faults, complete_twins, leave_out, option, rare
 from retwin.cli.plans import Scheduler, Workers, carry_out
 from retwin.cli.reading import read, updated_twin
-from retwin.cli.terminal import answer, example, table
+from retwin.cli.terminal import answer, bar, example, table
 from retwin.data.io import check_target
 from retwin.errors import InputError
 from retwin.serialisation.files import recover
@@ -36,9 +28,52 @@ from retwin.times import to_samples
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
-    from retwin.data.trajectories import Channels
+    from retwin.data.trajectories import Channels, Trajectories
     from retwin.twins.limits import Limits
     from retwin.twins.twin import Twin
+
+
+def film_settings(
+    film: Path | None, name: str | None, fps: float | None, size: str | None, renderer: str | None
+) -> dict[str, Any]:
+    """The settings of a film that were given, checked before the work."""
+    if film is None:
+        others = {"--id": name, "--fps": fps, "--size": size, "--renderer": renderer}
+        leave_out(others, "without --film")
+        return {}
+    from retwin.cases.animation.film import check_film
+
+    check_film(film)
+    made = {"index": name, "fps": fps, "size": size and _size(size), "renderer": renderer}
+    return {name: value for name, value in made.items() if value is not None}
+
+
+def draw_film(
+    film: Path,
+    trajectories: Trajectories,
+    twin: Twin,
+    system: Case | None,
+    settings: dict[str, Any],
+) -> None:
+    """Film a trajectory, with the bands of a corrected twin."""
+    from retwin.cases.animation import animate
+    from retwin.update import CorrectedTwin, DynamicsTwin
+
+    expected, remedy = "the case of the trajectories, which draws them", "give --case NAME"
+    case = given("--case", system, expected, remedy=remedy)
+    updated = twin if isinstance(twin, CorrectedTwin | DynamicsTwin) else None
+    with bar("film") as show:
+        settings = {"updated": updated, "progress": lambda share: show("draw", share), **settings}
+        path = animate(trajectories, case, film, **settings)
+    answer(path, str(path))
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    expected, remedy = "WIDTHxHEIGHT in pixels", "give it like 640x480"
+    found = given("--size", found, expected, got=repr(text), remedy=remedy)
+    return int(found[1]), int(found[2])
+
 
 app = Commands(help="List, describe and simulate twins.", epilog=example("retwin twin info armpi"))
 
@@ -67,12 +102,12 @@ def info(
     twin: Annotated[
         str | None, argument("TWIN", "Else all are listed.", autocompletion=complete_twins)
     ] = None,
-    inputs: Inputs = "",
-    outputs: Outputs = "",
+    inputs: options.Inputs = "",
+    outputs: options.Outputs = "",
     rate: Rate = None,
     servo: Servos = None,
     no_meshes: NoMeshes = False,
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> None:
     """Describe a twin: its inputs with their limits, its outputs, its rate.
 
@@ -157,7 +192,7 @@ def simulate(
     fault: Annotated[
         str, option("NAME", "A class, all (in turn), or none.", autocompletion=complete_faults)
     ] = "none",
-    seed: Seed = 0,
+    seed: options.Seed = 0,
     film: Annotated[
         Path | None, option("FILE", "Film of --out, else of --commands: *.mp4 or *.gif.")
     ] = None,
@@ -172,8 +207,8 @@ def simulate(
     duration: Annotated[
         float | None, rare("SECONDS", "Of commands that no case draws.", min=1e-9)
     ] = None,
-    inputs: Inputs = "",
-    outputs: Outputs = "",
+    inputs: options.Inputs = "",
+    outputs: options.Outputs = "",
     rate: Rate = None,
     servo: Servos = None,
     no_meshes: NoMeshes = False,
@@ -181,7 +216,7 @@ def simulate(
     workers: Workers = None,
     scheduler: Scheduler = None,
     chunk: Annotated[int, rare("N", "Trajectories per chunk.", min=1)] = 256,
-    max_bytes: MaxBytes = None,
+    max_bytes: options.MaxBytes = None,
 ) -> None:
     """Simulate trajectories to a file, or film one.
 
@@ -224,10 +259,10 @@ def _twin(
     no_meshes: bool,
 ) -> Twin:
     """The twin of that name, or the model in that folder."""
-    options: dict[str, Any] = {"meshes": False} if no_meshes else {}
+    settings: dict[str, Any] = {"meshes": False} if no_meshes else {}
     if servos:
-        options["servos"] = list(map(_servo, servos))
-    own = not (inputs or outputs or rate or options)
+        settings["servos"] = list(map(_servo, servos))
+    own = not (inputs or outputs or rate or settings)
     if own and (recover(name) / "model.json").is_file():
         return _model(Path(name))
     if _is_case(name) and own:
@@ -235,7 +270,11 @@ def _twin(
 
         return cases.get(name).twin
     return twins.get(
-        name, inputs=channel_names(inputs), outputs=channel_names(outputs), rate=rate, **options
+        name,
+        inputs=options.channel_names(inputs),
+        outputs=options.channel_names(outputs),
+        rate=rate,
+        **settings,
     )
 
 
@@ -247,12 +286,9 @@ def _servo(text: str) -> tuple[str, Any]:
     try:
         stiffness, damping = map(float, gains.split(","))
     except ValueError:
-        raise InputError(
-            "--servo",
-            expected="JOINT=STIFFNESS,DAMPING in N m/rad and N m s/rad",
-            got=repr(text),
-            remedy="write for instance --servo hip=500,40",
-        ) from None
+        expected = "JOINT=STIFFNESS,DAMPING in N m/rad and N m s/rad"
+        remedy = "write for instance --servo hip=500,40"
+        raise InputError("--servo", expected=expected, got=repr(text), remedy=remedy) from None
     return joint, Servo(stiffness, damping)
 
 
@@ -315,12 +351,10 @@ def _sampler(system: Case | None, found: Twin, duration: float | None) -> Any:
         return system.sampler
     limits = getattr(found, "limits", None)
     bounded = limits is not None and all(map(isfinite, limits.low + limits.high))
+    expected = "commands, since not all inputs have limits within which to draw them"
+    remedy = "give --commands FILE, or --case NAME"
     require(
-        bounded or not len(found.inputs),
-        "--commands",
-        expected="commands, since not all inputs have limits within which to draw them",
-        got="none",
-        remedy="give --commands FILE, or --case NAME",
+        bounded or not len(found.inputs), "--commands", expected=expected, got="none", remedy=remedy
     )
     expected = "the duration of a trajectory in seconds, since no case draws commands"
     remedy = "give --duration SECONDS, --commands FILE, or --case NAME"

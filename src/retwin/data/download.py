@@ -19,8 +19,6 @@ from retwin.serialisation.sizes import Budget
 
 CACHE_VARIABLE = "RETWIN_CACHE"
 """The environment variable that names the cache folder."""
-TIMEOUT = 30.0
-"""Seconds without an answer after which a download fails."""
 MAX_SECONDS = 3600.0
 """Seconds after which a download fails that is not complete, however slowly it goes on."""
 MAX_BYTES = 2**32
@@ -187,8 +185,9 @@ class Transfer(threading.Thread):
 
         # Packed contents could inflate to any size, and would have another SHA-256.
         plain = {"Accept-Encoding": "identity"}
+        # Seconds without an answer after which a download fails.
         with (
-            requests.get(self._url, stream=True, timeout=TIMEOUT, headers=plain) as answer,
+            requests.get(self._url, stream=True, timeout=30.0, headers=plain) as answer,
             open(self._output, "wb") as file,
         ):
             answer.raise_for_status()

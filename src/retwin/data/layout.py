@@ -104,13 +104,11 @@ def opened(path: Path, encoding: str) -> TextIO:
 def lines_of(file: TextIO, path: Path) -> Iterator[str]:
     """Lines of bounded length without zero characters."""
     while line := file.readline(LONGEST):
-        require(
-            len(line) < LONGEST and "\0" not in line,
-            path.name,
-            expected=f"lines of text of less than {LONGEST} characters",
-            got="a longer one" if len(line) == LONGEST else "a zero byte",
-            remedy="check that it is a text table, and whole",
-        )
+        textual = len(line) < LONGEST and "\0" not in line
+        expected = f"lines of text of less than {LONGEST} characters"
+        got = "a longer one" if len(line) == LONGEST else "a zero byte"
+        remedy = "check that it is a text table, and whole"
+        require(textual, path.name, expected=expected, got=got, remedy=remedy)
         yield line
 
 
@@ -200,13 +198,9 @@ def _by_numbers(lines: Sequence[str], place: str) -> tuple[str, int, Row, Row]:
             count = sum(_is_value(cell, separator != ",") for cell in values)
             # More numbers win; blanks only where nothing else separates.
             found.append(((several, bool(separator), count), separator, first, rows))
-    require(
-        found,
-        place,
-        expected="a table of numbers",
-        got=repr(lines[0].strip()[:60]) if lines else "an empty file",
-        remedy="check that it is the right file",
-    )
+    expected = "a table of numbers"
+    got = repr(lines[0].strip()[:60]) if lines else "an empty file"
+    require(found, place, expected=expected, got=got, remedy="check that it is the right file")
     _, separator, first, rows = max(found, key=lambda each: each[0])
     width = _width(rows, first)
     head = [row[:width] for row in _head(rows[:first], width, place)][-2:]

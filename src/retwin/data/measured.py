@@ -21,8 +21,6 @@ REPEATED, DISTINCT, FAR = 3, 10, 10.0
 """A value stands for a missing measurement if it occurs REPEATED times at least, and is FAR times
 further from all others, of which DISTINCT at least differ, than these are from each other. Codes
 such as -9999 are; sensors have noise, and hardly repeat a value so far away."""
-ROUNDED = 1e-6
-"""Relative difference of values that are one: resampling and float32 round."""
 
 
 def check_magnitude(argument: str, trajectories: Trajectories, *, ideal: bool = False) -> None:
@@ -53,17 +51,14 @@ def check_magnitude(argument: str, trajectories: Trajectories, *, ideal: bool = 
     limit = np.where(scale > 0, MAX_RATIO * scale, np.inf).clip(max=MAX_VALUE)
     i, _, k = np.argwhere(size > limit)[:1].T
     usual = "largest ideal output" if ideal else f"{USUAL:.0%} quantile of the output"
-    require(
-        not len(i),
-        f"{argument}.observed",
-        expected=f"measurements below {MAX_RATIO:g} times the {usual}",
-        got=", ".join(
-            f"{size[each, :, at].max():.3g} of {trajectories.outputs.names[at]} "
-            f"in {trajectories.ids[each]}"
-            for each, at in zip(i, k, strict=True)
-        ),
-        remedy="replace the values that stand for a missing measurement by NaN",
+    expected = f"measurements below {MAX_RATIO:g} times the {usual}"
+    got = ", ".join(
+        f"{size[each, :, at].max():.3g} of {trajectories.outputs.names[at]} "
+        f"in {trajectories.ids[each]}"
+        for each, at in zip(i, k, strict=True)
     )
+    remedy = "replace the values that stand for a missing measurement by NaN"
+    require(not len(i), f"{argument}.observed", expected=expected, got=got, remedy=remedy)
 
 
 def unmeasured(trajectories: Trajectories) -> str:
@@ -94,13 +89,15 @@ def unmeasured_outputs(trajectories: Trajectories, needed: Collection[str] = ())
     return np.array(made, dtype=np.str_)
 
 
-def stand_in(values: NDArray) -> tuple[float, int] | None:
+def stand_in(values: NDArray, *, rounded: float = 1e-6) -> tuple[float, int] | None:
     """The value that seems to stand for a missing measurement, and how often it occurs.
 
     Parameters
     ----------
     values : NDArray
         (n,) of one channel; NaN where nothing was measured.
+    rounded : float, default 1e-6
+        Relative difference of values that are one: resampling and float32 round.
 
     Returns
     -------
@@ -111,7 +108,7 @@ def stand_in(values: NDArray) -> tuple[float, int] | None:
     known = values[np.isfinite(values)]
     for extreme in (known.min, known.max) if len(known) else ():
         value = float(extreme())
-        others = known[~np.isclose(known, value, rtol=ROUNDED, atol=0.0)]
+        others = known[~np.isclose(known, value, rtol=rounded, atol=0.0)]
         if len(others) <= DISTINCT or len(known) - len(others) < REPEATED:
             continue
         low, high = float(others.min()), float(others.max())

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 Resampling = Literal["hold", "linear", "none"]
 BRIDGED = 2.5
 """Longest interval that is bridged by default, in sample periods: one lost sample."""
-SPARSE = 1.5
-"""Median interval, in sample periods, from which values are fewer than the samples."""
 SAME = 1e-3
 """Difference of times, in sample periods, that is rounding."""
 
@@ -24,12 +22,18 @@ def longest_bridge(times: NDArray, period: float) -> float:
     return BRIDGED * max(period, typical)
 
 
-def is_sparse(times: NDArray, period: float) -> bool:
+def is_sparse(times: NDArray, period: float, *, sparse: float = 1.5) -> bool:
     """Whether values at times (n,) have fewer samples than a period of so many s would give.
 
     Samples between them would be interpolated: they show no noise, and hold no information.
+
+    Parameters
+    ----------
+    sparse : float, default 1.5
+        Median interval, in sample periods, from which values are fewer than the samples.
+
     """
-    return len(times) > 1 and float(np.median(np.diff(times))) > SPARSE * period
+    return len(times) > 1 and float(np.median(np.diff(times))) > sparse * period
 
 
 def resample(

@@ -112,13 +112,10 @@ class Segments:
         rate = sample_rate("rate", rate)
         start = np.atleast_2d(np.asarray(start, dtype=float)) * rate
         settle = np.atleast_2d(np.asarray(settle, dtype=float)) * rate
-        require(
-            start.shape == settle.shape,
-            "segments",
-            expected=f"as many settle times as starts, {start.shape}",
-            got=settle.shape,
-            remedy="give both for every segment",
-        )
+        expected = f"as many settle times as starts, {start.shape}"
+        got = str(settle.shape)
+        remedy = "give both for every segment"
+        require(start.shape == settle.shape, "segments", expected=expected, got=got, remedy=remedy)
         valid = np.isfinite(start) & np.isfinite(settle)
         outside = valid & ((start < 0) | (settle > steps))
         if outside.any():

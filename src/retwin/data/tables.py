@@ -36,8 +36,6 @@ EVEN = "no times: rows at a given rate"
 """What is noted of a table without a column of times."""
 THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 """A number with a comma that may stand before decimals or before thousands."""
-BLOCK = 65_536
-"""Rows that are converted together."""
 
 
 @dataclass(frozen=True)
@@ -191,12 +189,9 @@ def read_titled(path: Path, wanted: Sequence[str]) -> Table:
         layout = text_layout(*begin_of(path), path.name, wanted)
         return _read_columns(path, layout, wanted, empty=True, strict=True)
     except (OSError, UnicodeError) as error:
-        raise InputError(
-            str(path),
-            expected="a table of text",
-            got=getattr(error, "strerror", None) or f"{type(error).__name__}: {brief(error)}",
-            remedy="check the name of the file, and that it is the right one",
-        ) from None
+        got = getattr(error, "strerror", None) or f"{type(error).__name__}: {brief(error)}"
+        remedy = "check the name of the file, and that it is the right one"
+        raise InputError(str(path), expected="a table of text", got=got, remedy=remedy) from None
 
 
 def _read_columns(
@@ -245,7 +240,8 @@ def _blocks(path: Path, layout: Layout, *, empty: bool, strict: bool) -> Iterato
                 got = f"{len(row)} in line {number}"
                 remedy = "repair or remove that line; the last one of a log may be cut off"
                 raise InputError(path.name, expected=expected, got=got, remedy=remedy) from None
-            if len(block) == BLOCK:
+            # Rows that are converted together.
+            if len(block) == 65_536:
                 yield block
                 block = []
         if block:

@@ -51,15 +51,13 @@ class Channels:
 
     def __post_init__(self) -> None:
         texts = all(isinstance(text, str) for text in (*self.names, *self.units))
-        require(
-            texts
-            and len(self.names) == len(self.units)
-            and len(set(self.names)) == len(self.names),
-            "channels",
-            expected="texts, one unit per name and no name twice",
-            got=f"names {list(self.names)}, units {list(self.units)}",
-            remedy="name every channel once and give each a unit ('1' when it has none)",
+        paired = (
+            texts and len(self.names) == len(self.units) and len(set(self.names)) == len(self.names)
         )
+        expected = "texts, one unit per name and no name twice"
+        got = f"names {list(self.names)}, units {list(self.units)}"
+        remedy = "name every channel once and give each a unit ('1' when it has none)"
+        require(paired, "channels", expected=expected, got=got, remedy=remedy)
 
     def __len__(self) -> int:
         return len(self.names)

@@ -80,13 +80,11 @@ def conclude(
         return Conclusion(found.probabilities, found.labels, found.reason, remark, found)
     probabilities = np.asarray(diagnoser.predict_proba(trajectories))
     shape = len(trajectories), len(diagnoser.classes)
-    require(
-        probabilities.dtype.kind in "biuf" and probabilities.shape == shape,
-        "diagnoser",
-        expected=f"probabilities of {shape[1]} classes",
-        got=f"{probabilities.dtype} of shape {probabilities.shape}",
-        remedy="train it anew, or give another one",
-    )
+    fits = probabilities.dtype.kind in "biuf" and probabilities.shape == shape
+    expected = f"probabilities of {shape[1]} classes"
+    got = f"{probabilities.dtype} of shape {probabilities.shape}"
+    remedy = "train it anew, or give another one"
+    require(fits, "diagnoser", expected=expected, got=got, remedy=remedy)
     reason = unmeasured_outputs(trajectories)
     labels = np.array(diagnoser.classes)[probabilities.argmax(axis=1)]
     remark = "only trajectories without any measurement are called unknown; a bundle has a guard"

@@ -8,9 +8,6 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 
-FEW = 3
-"""Healthy trajectories below which their spread tells next to nothing of a further one."""
-
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -54,7 +51,8 @@ class Calibration:
             f"{self.false_rate:.2g} of further ones are to be unknown{doubt}; of "
             f"{self.simulated} that the corrected twin simulates, {self.below} are"
         )
-        if self.runs < FEW:
+        # Healthy trajectories below which their spread tells next to nothing of a further one.
+        if self.runs < 3:
             text += (
                 f". From {self.runs} of them foreign data cannot be recognised unless its errors "
                 "are several times those in calibration"

@@ -9,13 +9,9 @@ from numpy.typing import NDArray
 
 from retwin.data.quality.finding import Finding
 
-CERTAIN = 0.99
-"""Probability of a diagnosis from which on it contradicts a label."""
 MAJORITY = 0.8
 """Share of the records of a label that are diagnosed as another class, where labels are exchanged;
 and of all other records that are diagnosed as labelled, where single labels are doubtful."""
-MIN_RECORDS = 3
-"""Records of a label from which on it may be exchanged as a whole."""
 
 
 def find_wrong_labels(
@@ -39,13 +35,15 @@ def find_wrong_labels(
         Names of the records.
 
     """
-    answers, certain = probabilities.argmax(axis=1), probabilities.max(axis=1) >= CERTAIN
+    # Probability of a diagnosis from which on it contradicts a label.
+    answers, certain = probabilities.argmax(axis=1), probabilities.max(axis=1) >= 0.99
     taken = dict[int, int]()
     for label in np.unique(labels).tolist():
         rows = labels == label
         counts = np.bincount(answers[rows & certain], minlength=len(classes))
         answer = int(counts.argmax())
-        if answer != label and counts[answer] >= max(MIN_RECORDS, MAJORITY * rows.sum()):
+        # Records of a label from which on it may be exchanged as a whole.
+        if answer != label and counts[answer] >= max(3, MAJORITY * rows.sum()):
             taken[label] = answer
     if set(taken) != set(taken.values()):
         taken = {}

@@ -62,11 +62,8 @@ def check_probabilities(trajectories: Trajectories, probabilities: NDArray) -> N
     """
     failed = trajectories.ids[~np.isfinite(probabilities).all(axis=1)].tolist()
     more = f" and {len(failed) - 5} more" if len(failed) > 5 else ""
-    require(
-        not failed,
-        "probabilities",
-        expected="finite probabilities from the diagnoser",
-        got=f"NaN for {', '.join(failed[:5])}{more}",
-        remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser anew "
-        "if it gives NaN for others too",
-    )
+    expected = "finite probabilities from the diagnoser"
+    got = f"NaN for {', '.join(failed[:5])}{more}"
+    remedy = "replace sentinel values in these trajectories by NaN, or train the diagnoser anew "
+    remedy += "if it gives NaN for others too"
+    require(not failed, "probabilities", expected=expected, got=got, remedy=remedy)

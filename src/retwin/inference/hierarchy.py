@@ -24,7 +24,7 @@ from scipy.special import gammaln, softmax
 from torch import Tensor
 
 from retwin.inference.hyperprior import Hyperprior, Variances
-from retwin.inference.priors import ROUNDING, GaussianPrior, inverse
+from retwin.inference.problem import ROUNDING, GaussianPrior, inverse
 from retwin.inference.solver import Solution
 
 FREEDOM = 2.0
@@ -33,15 +33,8 @@ be counts as much as two observations."""
 TIED = FREEDOM * 2.0 ** np.arange(6)
 """Degrees of freedom between which the data decide for the variances of tied groups, all of them as
 probable beforehand: the more, the more alike these variances are."""
-TOLERANCE = 1e-3
-"""Relative change of all variances below which they have converged."""
-MAX_STEPS = 200
-"""Steps of expectation-maximisation at most."""
 LARGEST = 1e3
 """Largest standard deviation, in units: what outputs hardly show is linear no further."""
-JITTER = 1e-13
-"""Added to the diagonal, relative to its largest element, where rounding makes a curvature
-indefinite."""
 WARM_UP, DRAWS = 20, 100
 """Draws of the variances that are left out first, and that are then averaged over."""
 FLAT, CONDITION = 0, -1
@@ -234,12 +227,20 @@ class Hierarchy:
         """(G,) variances of x about the regression, under conditions that have no replicate."""
         return self.variance + self.common
 
-    def learned(self, design: Design, likelihood: Likelihood) -> Hierarchy:
-        """The most probable hyperparameters for the linearised problem."""
+    def learned(self, design: Design, likelihood: Likelihood, *, max_steps: int = 200) -> Hierarchy:
+        """The most probable hyperparameters for the linearised problem.
+
+        Parameters
+        ----------
+        max_steps : int, default 200
+            Steps of expectation-maximisation at most.
+
+        """
         found = self
-        for _ in range(MAX_STEPS):
+        for _ in range(max_steps):
             before, found = found, found._step(design, likelihood)
-            if (found.total() / before.total()).log().abs().amax() < TOLERANCE:
+            # Relative change of all variances below which they have converged.
+            if (found.total() / before.total()).log().abs().amax() < 1e-3:
                 break
         return found
 
@@ -303,7 +304,9 @@ class Hierarchy:
         curvature = (curvature + curvature.mT) / 2 + identity
         factor, failed = torch.linalg.cholesky_ex(curvature)
         if failed.any():
-            rounding = JITTER * curvature.diagonal(dim1=1, dim2=2).amax(dim=1) * (failed > 0)
+            # Added to the diagonal, relative to its largest element, where rounding makes a
+            # curvature indefinite.
+            rounding = 1e-13 * curvature.diagonal(dim1=1, dim2=2).amax(dim=1) * (failed > 0)
             factor = torch.linalg.cholesky(curvature + rounding[:, None, None] * identity)
         covariance = torch.cholesky_inverse(factor) * scale
         weighted = features * precision[..., None]

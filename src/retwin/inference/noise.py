@@ -4,27 +4,96 @@ The scale of a group is learned by expectation-maximisation with the weights of 
 Little and Taylor, J. Am. Stat. Assoc. 84, 881, 1989). Successive samples have correlated errors, so
 that fewer count than were measured: a first-order autoregression of coefficient ρ has (1 + ρ) /
 (1 - ρ) samples per independent one.
+
+Robust losses of a standardised residual: how much a sample costs, and how much it counts.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from retwin.inference.losses import Loss, StudentT
 from retwin.inference.problem import Problem
+
+
+class Loss(Protocol):
+    """A loss ρ of the squared length q of a standardised residual with `size` components."""
+
+    def value(self, square: Tensor, size: int) -> Tensor:
+        """The loss ρ(q) in nats, 0 at q = 0."""
+
+    def weight(self, square: Tensor, size: int) -> Tensor:
+        """The weight 2 ρ'(q) of the sample in reweighted least squares."""
+
+
+@dataclass(frozen=True)
+class StudentT:
+    """Minus the log density of a multivariate Student t distribution, up to a constant.
+
+    Parameters
+    ----------
+    freedom : float
+        Degrees of freedom, above 0. With the default outliers hardly count, and Gaussian errors
+        lose little.
+
+    References
+    ----------
+    Lange, Little and Taylor, J. Am. Stat. Assoc. 84, 881 (1989).
+
+    """
+
+    freedom: float = 4.0
+
+    def value(self, square: Tensor, size: int) -> Tensor:
+        """The loss in nats."""
+        return 0.5 * (self.freedom + size) * torch.log1p(square / self.freedom)
+
+    def weight(self, square: Tensor, size: int) -> Tensor:
+        """The weight: about 1, less for outliers."""
+        return (self.freedom + size) / (self.freedom + square)
+
+    def expected(self, size: int) -> float:
+        """The mean loss of residuals that have this distribution, in nats."""
+        half = torch.tensor(0.5 * (self.freedom + size), dtype=torch.float64)
+        tail = torch.tensor(0.5 * self.freedom, dtype=torch.float64)
+        return float(half * (torch.digamma(half) - torch.digamma(tail)))
+
+
+@dataclass(frozen=True)
+class Tukey:
+    """Tukey's biweight: samples beyond `cutoff` standard deviations do not count at all.
+
+    Parameters
+    ----------
+    cutoff : float
+        In standard deviations, above 0. The default has 95 % efficiency under Gaussian noise.
+
+    References
+    ----------
+    Beaton and Tukey, Technometrics 16, 147 (1974).
+
+    """
+
+    cutoff: float = 4.685
+
+    def value(self, square: Tensor, size: int) -> Tensor:
+        """The loss in nats."""
+        inside = (square / self.cutoff**2).clamp_max(1)
+        return self.cutoff**2 / 6 * (1 - (1 - inside) ** 3)
+
+    def weight(self, square: Tensor, size: int) -> Tensor:
+        """The weight, from 1 to 0."""
+        return (1 - (square / self.cutoff**2).clamp_max(1)).square()
+
 
 HEAVY_TAILED = StudentT()
 """The loss of noise by default: glitches hardly count."""
-MAX_CORRELATION = 0.95
-"""Largest lag-one autocorrelation that is learned: beyond it the estimate is too uncertain."""
 LEVELS = 201
 """Levels of noise at which the common error of rounded values is computed, and terms of its sum."""
-SMALLEST_SHARE = 1e-6
-"""Smallest scale relative to the largest one: it keeps exact outputs from infinite weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +172,8 @@ class Noise:
         rounding: tuple[float, ...] = (),
         variance: Tensor | float = 0.0,
         floor: float = 1e-18,
+        max_correlation: float = 0.95,
+        smallest_share: float = 1e-6,
     ) -> Noise:
         """The noise that makes residuals most probable: one step of maximisation.
 
@@ -126,6 +197,11 @@ class Noise:
             (R, K, d), the posterior variance of the predicted outputs.
         floor : float
             Smallest scale, in the residual's unit.
+        max_correlation : float, default 0.95
+            Largest lag-one autocorrelation that is learned: beyond it the estimate is too
+            uncertain.
+        smallest_share : float, default 1e-6
+            Smallest scale relative to the largest one: it keeps exact outputs from infinite weight.
 
         """
         weights = self.weights(problem, residual)[..., None]
@@ -148,12 +224,12 @@ class Noise:
             variances = variances.clamp_min(lattice)
             scale.append((variances if len(self.scale[k]) > 1 else variances.mean(0, True)).sqrt())
             kept = residual / self.scale[k] * (weights * part).sqrt()
-            time = correlation_time(kept, seen, rows=False, limit=MAX_CORRELATION)
+            time = correlation_time(kept, seen, rows=False, limit=max_correlation)
             # Exact outputs have a scale of 0.
             share = (shared / scale[-1].square().mean().clamp_min(1e-300)).clamp_min(common)
             thinning.append(time + share * seen.sum() / blocks)
         scales = torch.stack(scale)
-        smallest = max(floor, SMALLEST_SHARE * float(scales.amax()))
+        smallest = max(floor, smallest_share * float(scales.amax()))
         return Noise(scales.clamp_min(smallest), torch.stack(thinning), self.loss)
 
 

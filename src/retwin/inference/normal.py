@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.compiler import call, compiled_files
-from retwin.inference.losses import StudentT
-from retwin.inference.noise import Noise
-from retwin.inference.priors import GaussianPrior
-from retwin.inference.problem import Problem
+from retwin.inference.noise import Noise, StudentT
+from retwin.inference.problem import GaussianPrior, Problem
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,10 +51,10 @@ def compiled_step(
     curvature, determinant = np.empty((rows, size, size)), np.empty(rows)
     done = np.empty(rows, np.uint8)
     tensors = residual, jacobian, x, prior.mean, prior.precision
-    damped = None if damping is None else _doubles(damping)
-    given = (*_samples(problem), *map(_doubles, tensors), damped)
+    damped = None if damping is None else doubles(damping)
+    given = (*_samples(problem), *map(doubles, tensors), damped)
     sizes = rows, samples, outputs, size, noise.scale.shape[1], reweightings
-    common = [*map(_doubles, (noise.scale, noise.thinning, *limits))]
+    common = [*map(doubles, (noise.scale, noise.thinning, *limits))]
     made = there, objective, curvature, determinant
     call(kernel, "gauss_newton", sizes, loss.freedom, common, (*given, *made, done))
     if not done.all():
@@ -76,9 +74,9 @@ def compiled_objective(
         return None
     rows, samples, outputs = residual.shape
     objective = np.empty(rows)
-    given = map(_doubles, (residual, x, prior.mean, prior.precision))
+    given = map(doubles, (residual, x, prior.mean, prior.precision))
     sizes = rows, samples, outputs, x.shape[1], noise.scale.shape[1]
-    common = [_doubles(noise.scale), _doubles(noise.thinning)]
+    common = [doubles(noise.scale), doubles(noise.thinning)]
     call(kernel, "objectives", sizes, loss.freedom, common, (*_samples(problem), *given, objective))
     return torch.from_numpy(objective)
 
@@ -96,11 +94,12 @@ def _samples(problem: Problem) -> tuple[NDArray | None, ...]:
     common = problem.common
     return (
         np.ascontiguousarray(problem.group.numpy(), np.int64),
-        _doubles(problem.measured),
-        None if common is None else _doubles(common.variance),
-        None if common is None else _doubles(common.block),
+        doubles(problem.measured),
+        None if common is None else doubles(common.variance),
+        None if common is None else doubles(common.block),
     )
 
 
-def _doubles(values: Tensor) -> NDArray:
+def doubles(values: Tensor) -> NDArray:
+    """The numbers in double precision, as kernels take them."""
     return np.ascontiguousarray(values.detach().numpy(), np.float64)

@@ -19,21 +19,14 @@ from torch import Tensor
 
 from retwin.inference.noise import Noise
 from retwin.inference.normal import compiled_objective, compiled_step
-from retwin.inference.priors import GaussianPrior, inverse
-from retwin.inference.problem import Problem, Rows
+from retwin.inference.problem import GaussianPrior, Problem, Rows, inverse
 
-TOLERANCE = 1e-4
-"""Predicted decrease of the objective, in nats, below which a row has converged."""
 MAX_STEPS = 25
 """Gauss-Newton steps at most."""
 REWEIGHTINGS = 3
 """Times that samples are weighted anew within a step: cheap beside a call of the surrogate."""
 DAMPING = 1e-6
 """Damping to begin with, relative to the diagonal of the curvature: next to none."""
-DAMPING_AFTER_FAILURE = 1e-3
-"""Damping at least, after a step that did not decrease the objective."""
-ALIGNED = 0.9
-"""Cosine of the angle between successive moves above which they are extrapolated."""
 LARGEST_RATIO = 0.8
 """Largest ratio of successive moves that is extrapolated: a move is made at most five times."""
 
@@ -205,6 +198,8 @@ def solve(
     bounds: Bounds | None = None,
     minimum_evidence: Tensor | None = None,
     reweightings: int = REWEIGHTINGS,
+    tolerance: float = 1e-4,
+    damping_after_failure: float = 1e-3,
 ) -> Solution:
     """The most probable latent variables, from `start` (R, P) on.
 
@@ -225,6 +220,10 @@ def solve(
     reweightings : int
         Times that samples are weighted anew within a step, at least 1: fewer where the Jacobian
         costs less than that.
+    tolerance : float, default 1e-4
+        Predicted decrease of the objective, in nats, below which a row has converged.
+    damping_after_failure : float, default 1e-3
+        Damping at least, after a step that did not decrease the objective.
 
     """
     x, linearised = start, problem.linearised(start)
@@ -239,7 +238,7 @@ def solve(
         how: Any = {"damping": damping, "bounds": bounds, "reweightings": reweightings}
         step = gauss_newton_step(problem, prior, noise, x, linearised, **how)
         occam = 0.5 * (prior.log_determinant - step.log_determinant)
-        done = (energy - step.objective < TOLERANCE) | (count == MAX_STEPS)
+        done = (energy - step.objective < tolerance) | (count == MAX_STEPS)
         if minimum_evidence is not None and count:
             hopeless = (occam - step.objective <= minimum_evidence[rows]) & (damping <= DAMPING)
         else:
@@ -278,7 +277,7 @@ def solve(
             )
             tried = residual, jacobian
         linearised = tried
-        raised = (8 * damping).clamp(DAMPING_AFTER_FAILURE, 1e6)
+        raised = (8 * damping).clamp(damping_after_failure, 1e6)
         raised = torch.where(factor > 1, damping, raised)
         damping = torch.where(better, (damping / 4).clamp_min(1e-9), raised)
         before = torch.where(better[:, None], move, 0.0)
@@ -332,7 +331,8 @@ def _extrapolation(move: Tensor, before: Tensor, metric: Tensor) -> Tensor:
     own, common = (left[:, 0] * move).sum(dim=1), (left[:, 0] * before).sum(dim=1)
     last = (left[:, 1] * before).sum(dim=1).clamp_min(1e-30)
     ratio = (common / last).clamp(0.0, LARGEST_RATIO)
-    aligned = (common > 0) & (common.square() > ALIGNED**2 * own * last)
+    # Cosine of the angle between successive moves above which they are extrapolated.
+    aligned = (common > 0) & (common.square() > 0.9**2 * own * last)
     return torch.where(aligned, 1 / (1 - ratio), 1.0)
 
 

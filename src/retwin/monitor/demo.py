@@ -42,9 +42,6 @@ PARAMETERS = {
     "start_heater": 40.0,
 }
 """Of the emulated machines; those of the twin differ by up to a sixth."""
-DURATION = 86_400.0
-"""Time in s by which the streams begin in the past, so that they are never ahead of the clock; they
-last for a day more."""
 PAUSE, SHADOW = 0.1, 15.0
 """Seconds between two batches of samples, and until a second version of the twin is fitted."""
 MACHINES: Mapping[str, tuple[str, TimedFault | None]] = {
@@ -143,11 +140,19 @@ def demonstration(folder: Path) -> Iterator[tuple[Live, Gate, Explanations]]:
         yield live, gate, explanations
 
 
-def _stream(gate: Gate, stop: threading.Event) -> None:
-    """Send the samples of all machines when they are due."""
-    record = emulated(2 * DURATION, 1, [fault for _, fault in MACHINES.values()])
+def _stream(gate: Gate, stop: threading.Event, *, duration: float = 86_400.0) -> None:
+    """Send the samples of all machines when they are due.
+
+    Parameters
+    ----------
+    duration : float, default 86_400.0
+        Time in s by which the streams begin in the past, so that they are never ahead of the clock;
+        they last for a day more.
+
+    """
+    record = emulated(2 * duration, 1, [fault for _, fault in MACHINES.values()])
     values = np.concatenate([record.commands, record.observed], axis=2)
-    began, begin, sent = time.monotonic(), time.time() - DURATION, 0
+    began, begin, sent = time.monotonic(), time.time() - duration, 0
     times = Trajectory("", int(begin * SECOND), values[0]).samples(record.rate).times
     while sent < record.steps and not stop.wait(PAUSE):
         due = min(SPEED * (time.monotonic() - began), time.time() - begin)

@@ -40,9 +40,6 @@ from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 from retwin.serialisation.files import sha256
 
-INTERVAL = 0.5
-"""Seconds after which new entries of the log are reported."""
-
 
 def run(settings: MonitorSettings, report: Callable[[str], None], stop: threading.Event) -> None:
     """Watch the machines until `stop` is set; what was acknowledged is durable then.
@@ -114,7 +111,8 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
             opened.callback(thread.join)
         opened.callback(stop.set)
         report(f"watching {', '.join(settings.assets)}")
-        while not stop.wait(INTERVAL):
+        # Seconds after which new entries of the log are reported.
+        while not stop.wait(0.5):
             news.read()
 
 
@@ -169,13 +167,11 @@ def _sources(
     if isinstance(settings, FolderSource):
         return _folders(settings, live, systems, report)
     for name in settings.nodes:
-        require(
-            not live.in_trajectories(name),
-            "sources",
-            expected=f"one that gives complete trajectories, for {name}",
-            got=f"one of single samples, {settings.type}",
-            remedy="send trajectories by MQTT or HTTP, or write them to a folder",
-        )
+        single = not live.in_trajectories(name)
+        expected = f"one that gives complete trajectories, for {name}"
+        got = f"one of single samples, {settings.type}"
+        remedy = "send trajectories by MQTT or HTTP, or write them to a folder"
+        require(single, "sources", expected=expected, got=got, remedy=remedy)
     rates = {name: live.monitor(name).twin.rate for name in systems}
     return [OpcUa(settings, channels, rates, report)]
 
@@ -195,13 +191,10 @@ def _folders(
         if isinstance(monitor, TrajectoryMonitor):
             recorded[name] = monitor, case
         else:
-            require(
-                settings.files.endswith((".csv", ".parquet")),
-                "sources.files",
-                expected=f"files that end with .csv or .parquet, for {name}",
-                got=settings.files,
-                remedy="give tables of samples, since its monitor watches no whole trajectories",
-            )
+            tabular = settings.files.endswith((".csv", ".parquet"))
+            expected = f"files that end with .csv or .parquet, for {name}"
+            remedy = "give tables of samples, since its monitor watches no whole trajectories"
+            require(tabular, "sources.files", expected=expected, got=settings.files, remedy=remedy)
             twin = monitor.twin
             layouts[name] = (
                 layout_of(settings, live.channels(name), case)

@@ -33,12 +33,6 @@ from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 from retwin.scores.segments import median_error_trajectory
 from retwin.scores.uses import error_of
 
-MANY_OUTPUTS = 6
-"""Number of outputs beyond which one pair of bars stands for all of them."""
-SEGMENTS = 10
-"""Number of segments below which no range of them is shown."""
-MOSTLY = 0.5
-"""The share of a trajectory that was measured, at least, if none was measured completely."""
 BAR = 0.38
 """Width of a bar; groups of bars are 1 apart."""
 
@@ -128,10 +122,11 @@ def _row(
     low, high = np.quantile(single, [0.05, 0.95])
     mean = float(means.mean())
     digits = places([mean, low, high])
+    # Number of segments below which no range of them is shown.
     texts = [
         number(mean, digits),
         span(ends, digits),
-        span((low, high) if total >= SEGMENTS else None, digits),
+        span((low, high) if total >= 10 else None, digits),
         number(generated, digits),
     ]
     return [text if text == "–" else behind(text, unit) for text in texts], total
@@ -163,8 +158,15 @@ def picture(study: Study) -> Figure | None:
     return Figure("summary", panels, keys, columns=2)
 
 
-def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
-    """The healthy test trajectory with the median error, in the output with the largest one."""
+def _trajectory(study: Study, pair: tuple[str, str], *, mostly: float = 0.5) -> Panel | None:
+    """The healthy test trajectory with the median error, in the output with the largest one.
+
+    Parameters
+    ----------
+    mostly : float, default 0.5
+        The share of a trajectory that was measured, at least, if none was measured completely.
+
+    """
     overlay, portrait = study.results.overlay, study.portrait
     if overlay is None or overlay.source != pair[0] or not portrait:
         return None
@@ -172,7 +174,7 @@ def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
     nominal, observed, times, bands = (portrait[name] for name in names)
     chosen = partial(median_error_trajectory, nominal, observed, times, study.overlaid_healthy)
     # Where no healthy trajectory is complete, one of which most was measured.
-    place = chosen() if chosen() is not None else chosen(at_least=MOSTLY)
+    place = chosen() if chosen() is not None else chosen(at_least=mostly)
     if place is None:
         return None
     outputs = study.results.outputs
@@ -229,7 +231,8 @@ def _bars(study: Study, change: ErrorChange, given: str, source: str) -> Panel:
     factor, unit = (1.0, "σ") if given == "σ" else quantity(given)
     before, after = factor * change.outputs_before, factor * change.outputs_after
     names = study.results.outputs.names
-    if len(before) > MANY_OUTPUTS or len(before) != len(names):
+    # Number of outputs beyond which one pair of bars stands for all of them.
+    if len(before) > 6 or len(before) != len(names):
         before, after = (np.array([factor * each]) for each in (change.before, change.after))
         names = ["all outputs"]
     marks = [

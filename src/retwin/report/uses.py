@@ -23,8 +23,6 @@ RULE = (
     "source on these runs is shown, which makes it look a little better than it is."
 )
 """The one rule, as a sentence."""
-WIDEST = 0.3
-"""The width of an interval of a share beyond which counts stand in its place."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +40,16 @@ class UseRow:
     missing: str
 
 
-def use_rows(results: Results) -> list[UseRow]:
-    """A row for each use of a study."""
-    limits = {"rate": RATE, "detection": DETECTION, "coverage": COVERAGE, "widest": WIDEST}
+def use_rows(results: Results, *, widest: float = 0.3) -> list[UseRow]:
+    """A row for each use of a study.
+
+    Parameters
+    ----------
+    widest : float, default 0.3
+        The width of an interval of a share beyond which counts stand in its place.
+
+    """
+    limits = {"rate": RATE, "detection": DETECTION, "coverage": COVERAGE, "widest": widest}
     limits |= {"classes": bool(results.classes), "emulated": results.emulated}
     rows = []
     for use in results.uses:

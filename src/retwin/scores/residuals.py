@@ -255,9 +255,7 @@ def spectra(
 
 
 def error_by_amplitude(
-    residual: NDArray,
-    amplitude: NDArray,
-    within: tuple[float, float] = (-np.inf, np.inf),
+    residual: NDArray, amplitude: NDArray, within: tuple[float, float] = (-np.inf, np.inf)
 ) -> Binned:
     """Errors in about `BINS` bins of equal counts of an amplitude, such as an output or a command.
 

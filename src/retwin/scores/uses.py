@@ -343,12 +343,7 @@ def _training(it: _Diagnoses) -> Use:
     )
     figures = {"macro_f1": score, "gain": Figure(value=gain, interval=ends), **it.figures(best)}
     return Use(
-        use="training",
-        answer=answer,
-        source=best,
-        plain=it.plain,
-        figures=figures,
-        missing=missing,
+        use="training", answer=answer, source=best, plain=it.plain, figures=figures, missing=missing
     )
 
 

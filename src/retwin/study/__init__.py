@@ -183,30 +183,19 @@ def _check_possible(case: Case, plan: StudyPlan) -> None:
         least, remedy = 2 * case.rate / case.sampler.steps, "give one between two samples per "
         remedy += "trajectory and the rate of the data"
         finite("rate", plan.rate, at_least=least, at_most=case.rate, unit="Hz", remedy=remedy)
-    require(
-        plan.encoder_noise == 0 or case.encoder_noise is not None,
-        "encoder_noise",
-        expected="0 for a case that does not state how encoder noise changes its outputs",
-        got=plan.encoder_noise,
-        remedy=f"leave it out for the case {case.name!r}",
-    )
+    stated = plan.encoder_noise == 0 or case.encoder_noise is not None
+    expected = "0 for a case that does not state how encoder noise changes its outputs"
+    remedy = f"leave it out for the case {case.name!r}"
+    require(stated, "encoder_noise", expected=expected, got=plan.encoder_noise, remedy=remedy)
     package = not_installed(CLASSIFIERS[plan.classifier_name].extra) if case.diagnosed else ""
-    require(
-        not package,
-        "classifier",
-        expected=f"for {plan.classifier_name!r} {package}",
-        got="no such package",
-        remedy="install it, or take another classifier",
-    )
+    expected = f"for {plan.classifier_name!r} {package}"
+    remedy = "install it, or take another classifier"
+    require(not package, "classifier", expected=expected, got="no such package", remedy=remedy)
     for name in plan.sources:
         missing = lacking(name, case, plan)
-        require(
-            not missing,
-            "sources",
-            expected=f"for {name!r} {missing}",
-            got=repr(name),
-            remedy="leave it out, or give 'all' for those that are possible",
-        )
+        expected = f"for {name!r} {missing}"
+        remedy = "leave it out, or give 'all' for those that are possible"
+        require(not missing, "sources", expected=expected, got=repr(name), remedy=remedy)
 
 
 def possible_sources(case: Case, plan: StudyPlan) -> tuple[str, ...]:

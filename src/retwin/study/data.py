@@ -19,9 +19,6 @@ from retwin.study.files import Roles
 from retwin.study.plan import StudyPlan
 from retwin.update.corrected import generate
 
-EMULATED_PER_CLASS = 10
-"""Emulated trajectories per class where there are no real ones: 90 for the arm, as measured."""
-
 
 @dataclass(frozen=True)
 class StudyData:
@@ -59,13 +56,10 @@ class StudyData:
     def __post_init__(self) -> None:
         stated = {name for name, file in vars(self).items() if file is not None} - {"twin"}
         mapped = stated & {"calibration", "test", "real"}
-        require(
-            self.mapping is None or mapped,
-            "mapping",
-            expected="real sets that are logs",
-            got=", ".join(sorted(stated - {"mapping"})) or "none",
-            remedy="give --real LOG, or --calibration LOG --test LOG; or leave the mapping out",
-        )
+        usable = self.mapping is None or mapped
+        got = ", ".join(sorted(stated - {"mapping"})) or "none"
+        remedy = "give --real LOG, or --calibration LOG --test LOG; or leave the mapping out"
+        require(usable, "mapping", expected="real sets that are logs", got=got, remedy=remedy)
         stated -= {"mapping"}
         fits = stated in ({"calibration", "test"}, {"real"}, {"records"}, set())
         expected = "either calibration and test, or real alone, or records alone"
@@ -117,12 +111,19 @@ def real_data(
     return real, Roles.of((first[fit], first[test]) for fit, test in folds)
 
 
-def _emulate(case: Case, healthy: int, seed: int) -> Trajectories:
-    """Few runs of each fault, and so many healthy ones."""
+def _emulate(case: Case, healthy: int, seed: int, *, emulated_per_class: int = 10) -> Trajectories:
+    """Few runs of each fault, and so many healthy ones.
+
+    Parameters
+    ----------
+    emulated_per_class : int, default 10
+        Emulated trajectories per class where there are no real ones: 90 for the arm, as measured.
+
+    """
     first, second = np.random.SeedSequence(seed).spawn(2)
     seeds = [int(each.generate_state(1)[0]) for each in (first, second)]
     emulator: Any = case.emulator
-    faulty = generate(emulator, case, per_class=EMULATED_PER_CLASS, seed=seeds[0])
+    faulty = generate(emulator, case, per_class=emulated_per_class, seed=seeds[0])
     if not case.diagnosed:
         return faulty
     faulty = faulty[faulty.labels != HEALTHY]
@@ -149,13 +150,10 @@ def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories
         for i, j, _ in find_copies(both.measured)
         if j < count <= i
     ]
-    require(
-        not shared,
-        "test",
-        expected="measurements that are in no calibration trajectory",
-        got="; ".join(shared[:3]) + (f"; {len(shared)} in all" if len(shared) > 3 else ""),
-        remedy="leave them out of one of both sets",
-    )
+    expected = "measurements that are in no calibration trajectory"
+    got = "; ".join(shared[:3]) + (f"; {len(shared)} in all" if len(shared) > 3 else "")
+    remedy = "leave them out of one of both sets"
+    require(not shared, "test", expected=expected, got=got, remedy=remedy)
     first = distinct_records(both.measured)
     return both, Roles.of([(first[first < count], first[first >= count])])
 

@@ -16,9 +16,6 @@ from retwin.nets.training import Training
 from retwin.times import sample_rate
 from retwin.update.corrected import MAX_PER_CLASS
 
-MAX_RUNS = 1000
-"""Runs beyond this number change no mean by more than 3 % of the spread between runs."""
-
 
 @dataclass(frozen=True)
 class Preset:
@@ -126,7 +123,8 @@ class StudyPlan:
         expected = "at least one source, none twice"
         remedy = f"choose from {', '.join(SOURCES)}"
         require(fits, "sources", expected=expected, got=self.sources, remedy=remedy)
-        whole("runs", self.number_of_runs, at_least=1, at_most=MAX_RUNS)
+        # Runs beyond this number change no mean by more than 3 % of the spread between runs.
+        whole("runs", self.number_of_runs, at_least=1, at_most=1000)
         whole("seed", self.seed)
         whole("folds", self.folds, at_least=2)
         if self.per_class is not None:

@@ -43,8 +43,6 @@ from retwin.update.identification import NPE, Posterior, Updated, identify
 from retwin.update.residual import Density, Mixture, SequenceMixture, fit_residual
 from retwin.update.surrogate import Surrogate, fit_surrogate
 
-MIN_HEALTHY = 5
-"""Least number of healthy calibration trajectories of which two can be held out to widen bands."""
 CURVE = (1, 2, 4, 6, 8, 12, 16, 24, 32)
 """Healthy calibration trajectories of the points of a learning curve, if there are more."""
 DRAWS = 500
@@ -332,13 +330,20 @@ class Work:
         single = self._refitted(trial, self._calibration(trial), density)
         return {"mean_only": replace(twin, random=False), "single_gaussian": single}
 
-    def _widening(self, trial: Trial) -> float | None:
+    def _widening(self, trial: Trial, *, min_healthy: int = 5) -> float | None:
         """Factor by which bands are widened, from healthy calibration trajectories held out.
 
         The RG is fitted to the rest of what it is fitted to for this, faulty trajectories included
         where it uses these; no test trajectory is used.
+
+        Parameters
+        ----------
+        min_healthy : int, default 5
+            Least number of healthy calibration trajectories of which two can be held out to widen
+            bands.
+
         """
-        if len(trial.healthy) < MIN_HEALTHY:
+        if len(trial.healthy) < min_healthy:
             return None
         seed = trial.seed("widening")
         fitted_on, held_out = self._calibration(trial).split(0.6, seed=seed)

@@ -22,14 +22,8 @@ from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.windows import simulated as simulated_outputs
 from retwin.update.forecasts import started_moments
 
-CLEAR = 0.5
-"""Ratio of residuals from which exchanged commands are named."""
-UNEXPLAINED = 0.1
-"""Share of the variance that a twin leaves, below which commands are in their places."""
 DIVERGED = 1e100
 """Size of outputs that no simulation has which does not diverge, and whose square is finite."""
-PAIRS = 15
-"""Pairs of commands that are tried, at most."""
 
 
 def check_with_twin(twin: Twin | None, records: Trajectories) -> Checked:
@@ -74,13 +68,22 @@ def simulated(twin: Twin, records: Trajectories) -> NDArray | None:
     return made if np.all(np.abs(made, dtype=float) < DIVERGED) else None
 
 
-def _find_exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
-    """Pairs of commands with which the twin explains more where they are exchanged."""
+def _find_exchanged(twin: Twin, records: Trajectories, *, clear: float = 0.5) -> Iterator[Finding]:
+    """Pairs of commands with which the twin explains more where they are exchanged.
+
+    Parameters
+    ----------
+    clear : float, default 0.5
+        Ratio of residuals from which exchanged commands are named.
+
+    """
     healthy = records[records.maybe_healthy] if records.maybe_healthy.any() else records
     here, names = _unexplained_share(healthy), records.inputs.names
-    if here < UNEXPLAINED:
+    # Share of the variance that a twin leaves, below which commands are in their places.
+    if here < 0.1:
         return
-    for a, b in list(combinations(range(len(names)), 2))[:PAIRS]:
+    # Pairs of commands that are tried, at most.
+    for a, b in list(combinations(range(len(names)), 2))[:15]:
         order = np.arange(len(names))
         order[[a, b]] = order[[b, a]]
         other = healthy.replace(commands=healthy.commands[..., order])
@@ -90,7 +93,7 @@ def _find_exchanged(twin: Twin, records: Trajectories) -> Iterator[Finding]:
         if ideal is None:
             continue
         there = _unexplained_share(other.replace(nominal=ideal))
-        if there < min(CLEAR * here, CLEAR):
+        if there < min(clear * here, clear):
             text = f"seems to be exchanged with {names[b]}: its twin explains {1 - there:.0%} of "
             text += f"the variance that way, {1 - here:.0%} as they are"
             yield Finding("", names[a], "exchanged", text)

@@ -30,9 +30,6 @@ from retwin.update.training_range import training_checked
 MAX_PER_CLASS = 10_000_000
 """Trajectories per class that are generated in memory at most: more fit into none."""
 
-BYTES_PER_NUMBER = 4
-"""The size of a generated number in bytes, in float32."""
-
 
 @dataclass(frozen=True, eq=False)
 class CorrectedTwin(OfTwin):
@@ -77,13 +74,10 @@ class CorrectedTwin(OfTwin):
 
     def started(self, record: Trajectories) -> CorrectedTwin:
         """The twin with the unknown starts of one record; see `DynamicsTwin.started`."""
-        require(
-            self.unknown_starts,
-            "record",
-            expected="a model of a StateTwin with unknown starts",
-            got="one whose starts are known, or cannot be set",
-            remedy="simulate it as it is; bounds make a start unknown",
-        )
+        expected = "a model of a StateTwin with unknown starts"
+        got = "one whose starts are known, or cannot be set"
+        remedy = "simulate it as it is; bounds make a start unknown"
+        require(self.unknown_starts, "record", expected=expected, got=got, remedy=remedy)
         surrogate: Any = self.surrogate
         return replace(self, surrogate=surrogate.started(record))
 
@@ -197,7 +191,8 @@ def generate(
     whole("per_class", per_class, at_least=1, at_most=MAX_PER_CLASS, remedy=remedy)
     width = len(twin.inputs) + 2 * len(twin.outputs)
     numbers = per_class * len(case.faults) * case.sampler.steps * width
-    Budget("per_class").take(BYTES_PER_NUMBER * numbers)
+    # The size of a generated number in bytes, in float32.
+    Budget("per_class").take(4 * numbers)
     if onsets is None and isinstance(twin, CorrectedTwin):
         onsets = twin.onsets
     for_commands, for_twin = np.random.SeedSequence(seed).spawn(2)

@@ -76,13 +76,11 @@ class DeviceTwin:
 
     def __init__(self, twin: CorrectedTwin, device: str | torch.device) -> None:
         instance("twin", twin, CorrectedTwin, remedy="fit a residual model, and give CorrectedTwin")
-        require(
-            isinstance(twin.surrogate, Surrogate),
-            "twin",
-            expected="a corrected twin with a neural surrogate",
-            got=f"one with {type(twin.surrogate).__name__} in its place",
-            remedy="train one with fit_surrogate, or simulate this twin on the processor",
-        )
+        neural = isinstance(twin.surrogate, Surrogate)
+        expected = "a corrected twin with a neural surrogate"
+        got = f"one with {type(twin.surrogate).__name__} in its place"
+        remedy = "train one with fit_surrogate, or simulate this twin on the processor"
+        require(neural, "twin", expected=expected, got=got, remedy=remedy)
         self.twin = twin
         self.device = _usable(device)
         self._surrogate = copy.deepcopy(twin.surrogate).to(self.device)
@@ -264,22 +262,17 @@ def _usable(device: str | torch.device) -> torch.device:
         found = torch.device(device)
         torch.zeros(1, dtype=torch.float64, device=torch.Generator(found).device)
     except (AssertionError, NotImplementedError, RuntimeError, TypeError) as error:
-        raise InputError(
-            "device",
-            expected="a device with double precision that this installation of torch can use",
-            got=f"{device} ({brief(error)})",
-            remedy="give 'cpu', or install torch for that device",
-        ) from error
+        expected = "a device with double precision that this installation of torch can use"
+        got = f"{device} ({brief(error)})"
+        remedy = "give 'cpu', or install torch for that device"
+        raise InputError("device", expected=expected, got=got, remedy=remedy) from error
     return found
 
 
 def _check_finite(made: Records) -> None:
     wrong = ~(made.nominal.isfinite() & made.observed.isfinite()).flatten(1).all(dim=1)
-    require(
-        not bool(wrong.any()),
-        "commands",
-        expected="commands for which the twin's outputs are finite",
-        got=f"NaN or an infinite output in {int(wrong.sum())} of {len(wrong)} trajectories, first "
-        f"in trajectory {int(wrong.byte().argmax())}",
-        remedy="simulate it with CorrectedTwin.simulate, which names the output and the time",
-    )
+    expected = "commands for which the twin's outputs are finite"
+    got = f"NaN or an infinite output in {int(wrong.sum())} of {len(wrong)} trajectories, first "
+    got += f"in trajectory {int(wrong.byte().argmax())}"
+    remedy = "simulate it with CorrectedTwin.simulate, which names the output and the time"
+    require(not bool(wrong.any()), "commands", expected=expected, got=got, remedy=remedy)

@@ -97,13 +97,10 @@ class ExactSurrogate(OfTwin):
         differentiated = torch.is_grad_enabled() and commands.requires_grad
         if isinstance(self.twin, nn.Module) or (differentiated and callable(self.twin)):
             return self.twin(commands)
-        require(
-            not differentiated,
-            "surrogate",
-            expected="a twin that is a torch module or a StateTwin, to be differentiated",
-            got=type(self.twin).__name__,
-            remedy="fit a surrogate to it (fit_surrogate), or leave refinement out",
-        )
+        expected = "a twin that is a torch module or a StateTwin, to be differentiated"
+        got = type(self.twin).__name__
+        remedy = "fit a surrogate to it (fit_surrogate), or leave refinement out"
+        require(not differentiated, "surrogate", expected=expected, got=got, remedy=remedy)
         if self._warns:
             self._warns = False
             warnings.warn(
@@ -150,13 +147,9 @@ class ExactSurrogate(OfTwin):
                 return cls(equations_from(StateTwin, about["equations"]), differences=False)
         values, name = about.get("values"), about["case"]
         if twin is None:
-            require(
-                name,
-                "twin",
-                expected="the twin of this model, which has neither equations nor a case",
-                got="none",
-                remedy="give it in Python, load_twin(folder, twin), or fit a case.toml",
-            )
+            expected = "the twin of this model, which has neither equations nor a case"
+            remedy = "give it in Python, load_twin(folder, twin), or fit a case.toml"
+            require(name, "twin", expected=expected, got="none", remedy=remedy)
             system = catalog.resolve(catalog.OPENED_CASE)(name)
             twin = system.twin if values is None else system.parametric
         if values is None:
@@ -203,11 +196,8 @@ def exact_surrogate(given: Surrogate | Twin, *, differences: bool = True) -> Sur
     """
     if hasattr(given, "predict"):
         return given  # type: ignore[return-value]
-    require(
-        isinstance(given, Twin),
-        "surrogate",
-        expected="a surrogate, or a twin with inputs, outputs, rate and simulate",
-        got=type(given).__name__,
-        remedy="fit a surrogate with fit_surrogate",
-    )
+    expected = "a surrogate, or a twin with inputs, outputs, rate and simulate"
+    got = type(given).__name__
+    remedy = "fit a surrogate with fit_surrogate"
+    require(isinstance(given, Twin), "surrogate", expected=expected, got=got, remedy=remedy)
     return ExactSurrogate(given, differences=differences)  # type: ignore[return-value]

@@ -29,9 +29,6 @@ FEW = 5
 """Independent samples below which no band is promised: the 90 % quantile of four is none."""
 BY_LEAD = ("persistence", "deviation", "independent")
 """Fields of `ForecastErrors` with a row for each time ahead, in their order."""
-UNLIKE = 0.5
-"""Share of the width of its range by which half of the samples leave it in another unit or another
-channel."""
 BEYOND = 0.05
 """Share of the width of its range by which a value may leave it, as noise makes it."""
 
@@ -156,10 +153,17 @@ class ForecastErrors:
         )
 
 
-def warn_unlike(model: object, records: Trajectories) -> None:
+def warn_unlike(model: object, records: Trajectories, *, unlike: float = 0.5) -> None:
     """Warn of channels of which half of the samples are far outside the range of the calibration.
 
     Nothing is known of a model without calibrated bands.
+
+    Parameters
+    ----------
+    unlike : float, default 0.5
+        Share of the width of its range by which half of the samples leave it in another unit or
+        another channel.
+
     """
     errors: ForecastErrors | None = getattr(model, "forecast", None)
     if errors is None:
@@ -172,7 +176,7 @@ def warn_unlike(model: object, records: Trajectories) -> None:
     for i, (name, least, most, low, high) in enumerate(ends):
         own = values[np.isfinite(values[..., i])][:, None, [i]]
         excess = range_excess(own, errors.low[[i]], errors.high[[i]])
-        if own.size and np.median(excess) > UNLIKE:
+        if own.size and np.median(excess) > unlike:
             found.append(f"{name} is {least:.4g} to {most:.4g} here, {low:.4g} to {high:.4g} there")
     if found:
         warnings.warn(

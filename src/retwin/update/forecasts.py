@@ -31,18 +31,10 @@ from retwin.update.forecast_errors import (
     value_range,
 )
 
-DRAWS = 100
-"""Simulations of a trajectory whose mean and deviation stand for a distribution."""
-ORIGINS = 2000
-"""Samples from which predictions start, at most, of all trajectories together."""
 LEADS = (1, 3, 10, 30, 100)
 """Samples ahead at which errors are calibrated."""
 BEGIN = 10
 """The begin of a record is its part by this number."""
-DRIFT = 0.01
-"""Probability of a trend of errors over the time in a record that is no chance."""
-FORGOTTEN = 5.0
-"""Correlation times of errors after which one of them is forgotten."""
 
 
 def free_moments(twin: Twin, commands: NDArray, *, seed: int = 0) -> tuple[NDArray, NDArray]:
@@ -65,7 +57,8 @@ def free_moments(twin: Twin, commands: NDArray, *, seed: int = 0) -> tuple[NDArr
         return mean.numpy(), found.variance.double().sqrt().numpy()
     moments = []
     for i, each in enumerate(values):
-        drawn = twin.simulate(np.tile(each, (DRAWS, 1, 1)), seed=seed + i).observed
+        # Simulations of a trajectory whose mean and deviation stand for a distribution.
+        drawn = twin.simulate(np.tile(each, (100, 1, 1)), seed=seed + i).observed
         moments.append((drawn.mean(axis=0, dtype=np.float64), drawn.std(axis=0, dtype=np.float64)))
     means, deviations = (np.stack(each) for each in zip(*moments, strict=True))
     return means, deviations
@@ -169,7 +162,8 @@ def _from_states(twin: DynamicsTwin, record: Trajectories, leads: Sequence[int])
     states = twin.filter(commands, *rest)[2]
     count, steps = commands.shape[:2]
     longest = min(max(leads), steps - 1)
-    stride = max(1, count * steps // ORIGINS)
+    # Samples from which predictions start, at most, of all trajectories together.
+    stride = max(1, count * steps // 2000)
     row, origin = (each.ravel() for each in np.mgrid[:count, 0 : steps - 1 : stride])
     # Earlier commands, on which a spline between samples and dead times depend.
     delays = [twin.values[place] for _, place in twin.equations.delay_places]
@@ -229,7 +223,7 @@ def values_of(records: Trajectories) -> NDArray:
 
 
 def calibrate_forecasts(
-    records: Trajectories, found: Sequence[LeftOut], leads: Sequence[int]
+    records: Trajectories, found: Sequence[LeftOut], leads: Sequence[int], *, forgotten: float = 5.0
 ) -> ForecastErrors:
     """The errors of predictions, from parts of records that the models were not fitted to.
 
@@ -246,6 +240,8 @@ def calibrate_forecasts(
         The parts.
     leads : sequence of int
         Samples ahead of the predictions.
+    forgotten : float, default 5.0
+        Correlation times of errors after which one of them is forgotten.
 
     """
     inner = [each for each in found if not each.edge]
@@ -254,7 +250,7 @@ def calibrate_forecasts(
     whole = all(each.held[each.record.mask.any(axis=2)].all() for each in inner)
     rows = [[_calibrate(pairs, channel, whole=whole) for channel in channels] for pairs in errors]
     persistence, deviation, independent, correlation = np.moveaxis(np.array(rows), 2, 0)
-    memory = float(FORGOTTEN * correlation[-1].max() / records.rate)
+    memory = float(forgotten * correlation[-1].max() / records.rate)
     started = _calibrate_started(inner, whole=whole)
     held = [each.excess for each in found if _hold_all(each, deviation[-1], started)]
     beyond = np.maximum(BEYOND, np.max([0.0 * found[0].excess, *held], axis=0))
@@ -282,7 +278,7 @@ def _calibrate_started(found: Sequence[LeftOut], *, whole: bool) -> NDArray | No
     return np.array([_calibrate(errors, i, whole=whole)[1] for i in channels])
 
 
-def errors_drift(errors: NDArray) -> bool:
+def errors_drift(errors: NDArray, *, drift: float = 0.01) -> bool:
     """Whether the mean error of an output has a linear trend over the time in a record.
 
     By Student's t test of the slope, with as many errors as are independent beside the trend.
@@ -291,6 +287,8 @@ def errors_drift(errors: NDArray) -> bool:
     ----------
     errors : ndarray, shape (r, T, d_y)
         Of samples that were left out of a fit, NaN elsewhere; a row is a record, or a part of one.
+    drift : float, default 0.01
+        Probability of a trend of errors over the time in a record that is no chance.
 
     """
     for own in np.moveaxis(errors, 2, 0):
@@ -305,7 +303,7 @@ def errors_drift(errors: NDArray) -> bool:
         free = seen.sum() / correlation_time(rest[..., None]) - 2
         if free > 0 and power > 0:
             deviation = np.sqrt(np.sum(rest**2) / (free * power))
-            if abs(slope) > stdtrit(free, 1 - DRIFT / 2 / errors.shape[2]) * deviation:
+            if abs(slope) > stdtrit(free, 1 - drift / 2 / errors.shape[2]) * deviation:
                 return True
     return False
 

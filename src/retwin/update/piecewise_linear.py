@@ -16,12 +16,6 @@ import torch
 from numpy.polynomial import chebyshev
 from torch import Tensor
 
-ROUNDINGS = 4
-"""Deviation from a straight line that counts as rounding, in roundings of the larger end."""
-STRIDE = 4
-"""Of this many samples of a piece one is compared with the chord."""
-MAX_POINTS = 24
-"""Largest number of Chebyshev points on one piece."""
 TOLERANCE = 3e-6
 """Largest value of a polynomial's last two coefficients, in units of the outputs. Coefficients
 decrease geometrically, so the truncation error is some thirty times smaller."""
@@ -125,13 +119,24 @@ class _Ramps:
         return both[:, :-2], both[:, -2:].abs()
 
 
-def _ramps(flat: Tensor, begin: Tensor, length: Tensor) -> tuple[list[_Ramps], Tensor]:
-    """The pieces that are straight and longer than their points, and the other samples (k,)."""
+def _ramps(
+    flat: Tensor, begin: Tensor, length: Tensor, *, stride: int = 4, max_points: int = 24
+) -> tuple[list[_Ramps], Tensor]:
+    """The pieces that are straight and longer than their points, and the other samples (k,).
+
+    Parameters
+    ----------
+    stride : int, default 4
+        Of this many samples of a piece one is compared with the chord.
+    max_points : int, default 24
+        Largest number of Chebyshev points on one piece.
+
+    """
     ramps, others = [], []
     for n in length.unique().tolist():
         first = begin[length == n]
         samples = first[:, None] + torch.arange(n)
-        count = min(7 + n // 7, MAX_POINTS)
+        count = min(7 + n // 7, max_points)
         if count >= n:
             others.append(samples.flatten())
             continue
@@ -139,9 +144,9 @@ def _ramps(flat: Tensor, begin: Tensor, length: Tensor) -> tuple[list[_Ramps], T
         start, stop = (flat[each][:, None] for each in (first, first + n))
         # No sample bends by more than rounding, so between two that are compared with the chord the
         # deviation is at most twice as large again.
-        some = samples[:, ::STRIDE]
+        some = samples[:, ::stride]
         compared = flat.index_select(0, some.flatten()).view(*some.shape, -1)
-        deviation = compared - torch.lerp(start, stop, at[::STRIDE])
+        deviation = compared - torch.lerp(start, stop, at[::stride])
         straight = (deviation.abs() <= _rounding(start, stop)).flatten(1).all(dim=1)
         points = torch.lerp(start, stop, places)
         ramps.append(_Ramps(samples[straight], points[straight], matrix))
@@ -162,9 +167,16 @@ def _interpolation(length: int, count: int, dtype: torch.dtype) -> tuple[Tensor,
     return of_samples, of_points, of_values
 
 
-def _rounding(one: Tensor, other: Tensor) -> Tensor:
-    """Largest effect of rounding on commands between these."""
-    return ROUNDINGS * torch.finfo(one.dtype).eps * torch.maximum(one.abs(), other.abs())
+def _rounding(one: Tensor, other: Tensor, *, roundings: int = 4) -> Tensor:
+    """Largest effect of rounding on commands between these.
+
+    Parameters
+    ----------
+    roundings : int, default 4
+        Deviation from a straight line that counts as rounding, in roundings of the larger end.
+
+    """
+    return roundings * torch.finfo(one.dtype).eps * torch.maximum(one.abs(), other.abs())
 
 
 def _samples(begin: Tensor, length: Tensor) -> Tensor:

@@ -9,13 +9,6 @@ from scipy.stats import t as student
 
 NORMAL_95 = 1.96
 """Standard errors from an estimate to an end of its 95 % interval."""
-BLOCKS = 8
-"""Blocks of time over which residuals are summed, of all trajectories together."""
-SHARED = 0.5
-"""Share of the information on a direction that one block may have: beyond it, as with the start of
-a state, sums over blocks say nothing of the error."""
-MAX_AUTOCORRELATION = 0.999
-"""Largest lag-one autocorrelation, which bounds the correlation time at 1999 samples."""
 
 
 def score_covariance(score: NDArray, residual: NDArray, measured: int) -> tuple[NDArray, NDArray]:
@@ -69,7 +62,9 @@ def score_covariance(score: NDArray, residual: NDArray, measured: int) -> tuple[
     sums -= sums.mean(axis=0)
     count = np.zeros((number, size))
     np.add.at(count, block.ravel(), (score**2).sum(axis=2).reshape(-1, size))
-    spread = number > 1 and (count.max(axis=0) < SHARED * np.maximum(count.sum(axis=0), 1e-300))
+    # Share of the information on a direction that one block may have: beyond it, as with the start
+    # of a state, sums over blocks say nothing of the error.
+    spread = number > 1 and (count.max(axis=0) < 0.5 * np.maximum(count.sum(axis=0), 1e-300))
     by_blocks = sums.T @ sums * number / max(number - 1, 1)
     usual = np.maximum(np.diag(covariance), 1e-300)
     factor = np.sqrt(np.where(spread, np.diag(by_blocks) / usual, 0.0))
@@ -79,10 +74,17 @@ def score_covariance(score: NDArray, residual: NDArray, measured: int) -> tuple[
     return covariance * np.outer(factor, factor), np.where(more, few, freedom)
 
 
-def blocks_of(residual: NDArray) -> NDArray:
-    """The block of time (n, P) of each sample, of `BLOCKS` in all, with equally many measured."""
+def blocks_of(residual: NDArray, *, blocks: int = 8) -> NDArray:
+    """The block of time (n, P) of each sample, of `blocks` in all, with equally many measured.
+
+    Parameters
+    ----------
+    blocks : int, default 8
+        Blocks of time over which residuals are summed, of all trajectories together.
+
+    """
     seen = np.any(residual != 0, axis=2)
-    number = max(1, -(-BLOCKS // len(residual)))
+    number = max(1, -(-blocks // len(residual)))
     place = np.cumsum(seen, axis=1) - seen
     own = place * number // np.maximum(seen.sum(axis=1, keepdims=True), 1)
     return np.asarray(np.minimum(own, number - 1) + number * np.arange(len(residual))[:, None])
@@ -93,10 +95,17 @@ def variance_of(residual: NDArray, measured: int, free: int) -> float:
     return float(np.sum(residual**2)) / max(measured - free, 1)
 
 
-def lag_one(residual: NDArray) -> float:
-    """The lag-one autocorrelation of residuals (n, P, d_y), from 0 to `MAX_AUTOCORRELATION`."""
+def lag_one(residual: NDArray, *, max_autocorrelation: float = 0.999) -> float:
+    """The lag-one autocorrelation of residuals (n, P, d_y), from 0 to `max_autocorrelation`.
+
+    Parameters
+    ----------
+    max_autocorrelation : float, default 0.999
+        Largest lag-one autocorrelation, which bounds the correlation time at 1999 samples.
+
+    """
     power = float(np.sum(residual**2))
     if power == 0 or residual.shape[1] < 2:
         return 0.0
     correlation = float(np.sum(residual[:, 1:] * residual[:, :-1])) / power
-    return min(max(correlation, 0.0), MAX_AUTOCORRELATION)
+    return min(max(correlation, 0.0), max_autocorrelation)

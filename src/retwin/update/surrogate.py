@@ -33,13 +33,8 @@ TRAJECTORIES_PER_BATCH = 8
 """Trajectories per evaluation of a network with memory: more do not fit the cache."""
 SAMPLES_PER_BLOCK = 2**17
 """Samples, in whole trajectories, that are searched for linear pieces together."""
-SAMPLES_PER_BATCH = 2048
-"""Samples per evaluation of a network without memory: more do not fit the cache."""
 MIN_TRAJECTORIES = 10
 """Smallest number of trajectories to fit on: a tenth each is held out for validation and test."""
-MAX_HELD_OUT = 1000
-"""Largest number of trajectories that are held out for validation, and for test: the relative
-standard error of an RMSE from a thousand is about 2 %."""
 MAX_SAMPLES = 200_000
 """Largest number of distinct samples that a network without memory is trained on; more do not lower
 the error."""
@@ -143,7 +138,8 @@ class Surrogate(nn.Module):
             return torch.from_numpy(compiled)
 
         def function(rows: Tensor) -> Tensor:
-            return torch.cat([self(some) for some in rows.split(SAMPLES_PER_BATCH)])
+            # Samples per evaluation of a network without memory: more do not fit the cache.
+            return torch.cat([self(some) for some in rows.split(2048)])
 
         return evaluate_piecewise_linear(function, commands, self.after.scale)
 
@@ -245,15 +241,15 @@ def fit_surrogate(
     """
     instance("twin", twin, Trajectories, remedy="simulate the twin, and give what it returns")
     channels = twin.commands.shape[2]
-    require(
-        len(twin) >= MIN_TRAJECTORIES and channels,
-        "twin",
-        expected=f"at least {MIN_TRAJECTORIES} trajectories with commands",
-        got=f"{len(twin)} trajectories with {channels} command channels",
-        remedy="load the file with its case, which recovers commands, or simulate more",
-    )
+    enough = len(twin) >= MIN_TRAJECTORIES and channels
+    expected = f"at least {MIN_TRAJECTORIES} trajectories with commands"
+    got = f"{len(twin)} trajectories with {channels} command channels"
+    remedy = "load the file with its case, which recovers commands, or simulate more"
+    require(enough, "twin", expected=expected, got=got, remedy=remedy)
     order = np.random.default_rng(seed).permutation(len(twin))
-    tenth = min(max(1, len(twin) // 10), MAX_HELD_OUT)
+    # Largest number of trajectories that are held out for validation, and for test: the relative
+    # standard error of an RMSE from a thousand is about 2 %.
+    tenth = min(max(1, len(twin) // 10), 1000)
     test, valid, fitted = order[:tenth], order[tenth : 2 * tenth], order[2 * tenth :]
     with isolated(seed):
         surrogate = Surrogate(network, inputs=twin.inputs, outputs=twin.outputs, rate=twin.rate)

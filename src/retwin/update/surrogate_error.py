@@ -15,11 +15,8 @@ from retwin.errors import InputError
 from retwin.twins.collected import SimulationError
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Context
-from retwin.update.corrections.warp import within
+from retwin.update.corrections.delays import within
 from retwin.update.surrogate import Surrogate, known_samples
-
-LARGEST_SHARE = 0.5
-"""Share of the mean square of the residual above which the surrogate's error is warned of."""
 
 
 def surrogate_variance(
@@ -70,8 +67,15 @@ def surrogate_variance(
     return torch.where(count > 0, square / count.clamp_min(1), held_out)
 
 
-def warn_of_error(context: Context, used: Trajectories) -> None:
-    """Warn where the surrogate's own error is most of what outputs differ by."""
+def warn_of_error(context: Context, used: Trajectories, *, largest_share: float = 0.5) -> None:
+    """Warn where the surrogate's own error is most of what outputs differ by.
+
+    Parameters
+    ----------
+    largest_share : float, default 0.5
+        Share of the mean square of the residual above which the surrogate's error is warned of.
+
+    """
     if context.surrogate_variance is None:
         return
     valid = torch.as_tensor(context.segments.valid)
@@ -82,7 +86,7 @@ def warn_of_error(context: Context, used: Trajectories) -> None:
     # Of an output that is never measured there is no difference.
     share = np.divide(error * count, square, out=np.zeros(len(error)), where=square > 0)
     worst = int(share.argmax())
-    if share[worst] > LARGEST_SHARE:
+    if share[worst] > largest_share:
         warnings.warn(
             f"surrogate: its own error is {np.sqrt(error[worst]):.3g} "
             f"{used.outputs.units[worst]} in {used.outputs.names[worst]} on these commands, "

@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 import retwin as rt
-from retwin.inference.losses import StudentT
-from retwin.inference.noise import Noise
+from retwin.inference.noise import Noise, StudentT
 from retwin.update.corrections.commands.offset_features import OffsetFeatures
 from retwin.update.corrections.commands.problem import COMMON_ERROR, CommandProblem
 

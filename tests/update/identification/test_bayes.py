@@ -26,7 +26,7 @@ from retwin.update.identification import (
     identify,
 )
 from retwin.update.identification.bayes import SIGNIFICANCE
-from retwin.update.identification.summaries import Summaries
+from retwin.update.identification.problem import Summaries
 
 WHITE = Noise(discrepancy=False)
 A, B = 1.0, -0.5

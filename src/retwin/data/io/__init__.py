@@ -150,9 +150,6 @@ def _format(path: Path) -> FormatEntry:
         " or ".join(f"*{name}" for name, each in FORMATS.items() if name and each.folder is kind)
         for kind in (False, True)
     )
-    raise InputError(
-        "path",
-        expected=f"a file {files}, a folder {folders} or one with a folder per class",
-        got=str(path) if regular else f"{path}, a pipe or a device",
-        remedy="convert the data to one of these",
-    )
+    expected = f"a file {files}, a folder {folders} or one with a folder per class"
+    got = str(path) if regular else f"{path}, a pipe or a device"
+    raise InputError("path", expected=expected, got=got, remedy="convert the data to one of these")

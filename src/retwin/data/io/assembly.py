@@ -15,9 +15,6 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-RATE_TOLERANCE = 1e-3
-"""Relative difference of sample rates that count as equal: files round their times."""
-
 
 class DataCase(Protocol):
     """Channels, sample rate and classes of the data of one system."""
@@ -205,13 +202,10 @@ def settle(
         units = zip(channels.units, wanted.units, strict=False)
         open_units = not case.classes and all(b in (a, "1") for a, b in units)
         same = channels.names == wanted.names and open_units
-        require(
-            channels in (wanted, unnamed) or same,
-            name,
-            expected=f"the channels of the case, {wanted}",
-            got=channels,
-            remedy="give the case that the data belong to",
-        )
+        alike = channels in (wanted, unnamed) or same
+        expected = f"the channels of the case, {wanted}"
+        remedy = "give the case that the data belong to"
+        require(alike, name, expected=expected, got=channels, remedy=remedy)
     unknown = sorted(trajectories.known_labels - set(case.classes))
     expected = f"classes of the case, {', '.join(case.classes)}"
     got = f"the unknown class {''.join(unknown[:1])!r}"
@@ -276,4 +270,5 @@ def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None)
 
 
 def _close(rate: float, other: float) -> bool:
-    return bool(np.isclose(rate, other, rtol=RATE_TOLERANCE, atol=0))
+    # Relative difference of sample rates that count as equal: files round their times.
+    return bool(np.isclose(rate, other, rtol=1e-3, atol=0))

@@ -23,8 +23,6 @@ from retwin.serialisation.sizes import Budget
 from retwin.workers.isolation import FileReader
 
 Reader = Callable[[Path, str, "DataCase | None", Budget, FileReader], Raw]
-COORDINATES = 3
-"""Outputs per sample in the arm's authors' files: x, y and z."""
 VARIABLES = ("trajCmds", "trajResps", "dataset", "motorCmdsRadius")
 """The variables of these files that are read."""
 BYTES_PER_BLOCK, BYTES_PER_NUMBER = 2**20, 8
@@ -119,7 +117,8 @@ def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget, _: 
 def _read_dataset(
     file: Path, where: str, case: DataCase | None, budget: Budget, reader: FileReader
 ) -> Raw:
-    width = len(case.outputs) if case is not None else COORDINATES
+    # Outputs per sample in the arm's authors' files: x, y and z.
+    width = len(case.outputs) if case is not None else 3
     paths = mat_variables(file, budget, reader, VARIABLES)
     if {"trajCmds", "trajResps"} <= set(paths):
         nominal = _upright(paths["trajCmds"], width, f"{where}: trajCmds")
@@ -130,12 +129,10 @@ def _read_dataset(
         nominal, observed = both[:, :width], both[:, width:]
         commands, recorded = None, None
     else:
-        raise InputError(
-            where,
-            expected="the variables trajCmds and trajResps, or dataset",
-            got=", ".join(sorted(mat_variables(file, budget, reader))) or "none",
-            remedy="give the folder of the authors' data as it is",
-        )
+        expected = "the variables trajCmds and trajResps, or dataset"
+        got = ", ".join(sorted(mat_variables(file, budget, reader))) or "none"
+        remedy = "give the folder of the authors' data as it is"
+        raise InputError(where, expected=expected, got=got, remedy=remedy)
     fits = len(nominal) == len(observed)
     expected = f"{len(nominal)} samples, as trajCmds"
     remedy = "sample both on the same grid"
@@ -169,21 +166,15 @@ def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None,
     if not series or any(data is None for data, _ in series):
         return None, None
     vectors = [data for data, _ in series if data is not None]
-    require(
-        all(len(data) == steps for data in vectors),
-        where,
-        expected=f"{steps} samples per motor, as trajCmds",
-        got=", ".join(str(len(data)) for data in vectors),
-        remedy="sample commands and paths on the same grid",
-    )
+    aligned = all(len(data) == steps for data in vectors)
+    expected = f"{steps} samples per motor, as trajCmds"
+    got = ", ".join(str(len(data)) for data in vectors)
+    remedy = "sample commands and paths on the same grid"
+    require(aligned, where, expected=expected, got=got, remedy=remedy)
     rates = {round(rate, 3) for _, rate in series if rate is not None}
-    require(
-        len(rates) <= 1,
-        where,
-        expected="one sample rate",
-        got=", ".join(f"{rate:g} Hz" for rate in sorted(rates)),
-        remedy="sample all motors on the same grid",
-    )
+    got = ", ".join(f"{rate:g} Hz" for rate in sorted(rates))
+    remedy = "sample all motors on the same grid"
+    require(len(rates) <= 1, where, expected="one sample rate", got=got, remedy=remedy)
     return np.stack(vectors, axis=1), next(iter(rates), None)
 
 
@@ -202,13 +193,10 @@ def _series(cell: Any, where: str) -> tuple[NDArray | None, float | None]:
     remedy = "repair the Time of the motor commands"
     require(len(times) == len(data) and growing, where, expected=expected, got=got, remedy=remedy)
     # The largest ratio of two sample periods that count as jitter: one sample less makes it 2.
-    require(
-        periods.max() <= 1.5 * periods.min(),
-        where,
-        expected="a constant sample rate",
-        got=f"steps from {periods.min():g} to {periods.max():g} s",
-        remedy="resample the commands",
-    )
+    expected = "a constant sample rate"
+    got = f"steps from {periods.min():g} to {periods.max():g} s"
+    remedy = "resample the commands"
+    require(periods.max() <= 1.5 * periods.min(), where, expected=expected, got=got, remedy=remedy)
     return data, float(1 / np.median(periods))
 
 

@@ -54,13 +54,10 @@ def read_mat(
     (x_name, y_name) = found[0]
     blocks = _cells(variables[x_name], f"{path.name}: {x_name}")
     labels = _cells(variables[y_name], f"{path.name}: {y_name}")
-    require(
-        blocks and len(blocks) == len(labels),
-        f"{path.name}: {y_name}",
-        expected=f"at least one trajectory and one class name for each, {len(blocks)}",
-        got=len(labels),
-        remedy="give one class name per trajectory ('' when it is unknown)",
-    )
+    complete = blocks and len(blocks) == len(labels)
+    expected = f"at least one trajectory and one class name for each, {len(blocks)}"
+    remedy = "give one class name per trajectory ('' when it is unknown)"
+    require(complete, f"{path.name}: {y_name}", expected=expected, got=len(labels), remedy=remedy)
     raws = []
     for i, (cell, label) in enumerate(zip(blocks, labels, strict=True)):
         where = f"{path.name}: {x_name}, trajectory {i}"

@@ -58,13 +58,10 @@ def read_npz(path: Path, *, max_bytes: int | None = None, **_: Any) -> Trajector
         # Not np.load: it leaves a damaged file open.
         zipfile.ZipFile(path) as archive,
     ):
-        require(
-            "header.npy" in archive.namelist(),
-            path.name,
-            expected="trajectories saved by retwin, with a header",
-            got="an NPZ file without",
-            remedy="give a file that `retwin data convert` wrote",
-        )
+        headed = "header.npy" in archive.namelist()
+        expected = "trajectories saved by retwin, with a header"
+        remedy = "give a file that `retwin data convert` wrote"
+        require(headed, path.name, expected=expected, got="an NPZ file without", remedy=remedy)
         header = parse_json(_array(archive, "header", budget).tobytes(), path.name)
         check_header(header, path.name)
         arrays = {name: _array(archive, name, budget) for name in NAMES}

@@ -293,13 +293,10 @@ def _check_size(array: Any, shape: list[int], chunk: int, where: str, *, copies:
     """
     where = f"{where}: {array.basename}"
     chunks = (min(array.chunks[0], chunk), *(max(1, size) for size in shape[1:]))
-    require(
-        list(array.shape) == shape and array.chunks == chunks,
-        where,
-        expected=f"shape {tuple(shape)}",
-        got=f"shape {array.shape} in chunks of {array.chunks}",
-        remedy="the folder is damaged: get or make it again",
-    )
+    intact = list(array.shape) == shape and array.chunks == chunks
+    got = f"shape {array.shape} in chunks of {array.chunks}"
+    remedy = "the folder is damaged: get or make it again"
+    require(intact, where, expected=f"shape {tuple(shape)}", got=got, remedy=remedy)
     # Other codecs may unpack a small file to any size.
     codecs = [type(codec).__name__ for codec in array.metadata.codecs]
     expected = f"numbers that are packed by {' and '.join(CODECS)}"

@@ -212,12 +212,10 @@ def signal_of(log: Log, name: str) -> Signal:
     there = [*log.signals, *(other for other, why in log.skipped.items() if why == UNWANTED)]
     alike = difflib.get_close_matches(name, there[:MAX_SIGNALS], n=3, cutoff=0.3)
     others = ", ".join(alike or there[:3]) or "none"
-    raise InputError(
-        log.name,
-        expected=f"the signal {name!r} of the mapping",
-        got=f"it without values ({log.skipped[name]})" if name in log.skipped else others,
-        remedy="name it as the log does; `retwin data map` lists all signals",
-    )
+    expected = f"the signal {name!r} of the mapping"
+    got = f"it without values ({log.skipped[name]})" if name in log.skipped else others
+    remedy = "name it as the log does; `retwin data map` lists all signals"
+    raise InputError(log.name, expected=expected, got=got, remedy=remedy)
 
 
 def in_order(signal: Signal, where: str, *, disorder: float = 10.0) -> tuple[Signal, list[str]]:
@@ -254,13 +252,10 @@ def in_order(signal: Signal, where: str, *, disorder: float = 10.0) -> tuple[Sig
     worst = int(np.argmin(steps))
     even = np.mean(np.abs(np.delete(steps, worst) - typical) <= EVEN * typical) > 1 - EVEN
     repeated = abs(HOUR + steps[worst] - typical) <= EVEN * typical and even
-    require(
-        (abs(HOUR + steps[worst]) > 1.5 * typical or steps[worst] >= -typical) and not repeated,
-        place,
-        expected="times of a clock that nobody sets",
-        got=f"one hour twice, at {times[worst]:g} s, as at the end of summer time",
-        remedy="record UTC, or add its offset to each time (+02:00), or split the log there",
-    )
+    steady = (abs(HOUR + steps[worst]) > 1.5 * typical or steps[worst] >= -typical) and not repeated
+    got = f"one hour twice, at {times[worst]:g} s, as at the end of summer time"
+    remedy = "record UTC, or add its offset to each time (+02:00), or split the log there"
+    require(steady, place, expected="times of a clock that nobody sets", got=got, remedy=remedy)
     expected = "times that increase"
     got = f"a step back of {-steps[worst]:g} s at {times[worst]:g} s"
     remedy = "split the log there, or give other times in [time] of a mapping: rate = … in "

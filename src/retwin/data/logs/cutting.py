@@ -13,9 +13,6 @@ from retwin.data.logs.mapping import Cut
 from retwin.data.logs.signals import Signal
 from retwin.errors import InputError
 
-MAX_PIECES = 100_000
-"""Trajectories that one log may be cut into: a level in the noise of a signal is crossed often."""
-
 
 @dataclass(frozen=True)
 class Piece:
@@ -89,7 +86,8 @@ def pieces(
 
 def _check_count(count: int) -> None:
     remedy = "give a longer gap or length, or another trigger"
-    at_most("cut", count, MAX_PIECES, "trajectories", remedy=remedy)
+    # Trajectories that one log may be cut into: a level in the noise of a signal is crossed often.
+    at_most("cut", count, 100_000, "trajectories", remedy=remedy)
 
 
 def _begin_with_commands(piece: Piece, commands: Sequence[Signal]) -> Piece:

@@ -219,13 +219,11 @@ class Parts:
         """The trajectories, each with its start in s as a name."""
         if not self.blocks:
             empty = [each.name for each in self.every if not np.isfinite(each.signal.values).any()]
-            raise InputError(
-                log.name,
-                expected="two samples at least with all commands and a measurement",
-                got=f"none, and no value at all of {', '.join(empty)}" if empty else "none",
-                remedy="check max_gap of the commands and [cut] in the mapping; `retwin data map` "
-                "draws them",
-            )
+            expected = "two samples at least with all commands and a measurement"
+            got = f"none, and no value at all of {', '.join(empty)}" if empty else "none"
+            remedy = "check max_gap of the commands and [cut] in the mapping; `retwin data map` "
+            remedy += "draws them"
+            raise InputError(log.name, expected=expected, got=got, remedy=remedy)
         n, stem = len(self.commands), Path(log.name).stem
         width = len(self.measured)
         digits = max(1, math.ceil(math.log10(self.rate)))  # starts differ by two samples at least

@@ -18,8 +18,6 @@ import numpy as np
 from retwin.checks import at_most, require
 from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Clock, Signal, Skipped, inside
 
-MAX_ELEMENTS = 64
-"""Elements of an array that become signals; images and point clouds have more."""
 MAX_DEPTH = 12
 """Messages inside messages at most."""
 MAX_NAME = 200
@@ -216,7 +214,8 @@ class Series:
     def _array(
         self, name: str, values: Sequence[Any] | np.ndarray, names: Sequence[str] | None, depth: int
     ) -> Iterator[tuple[str, float]]:
-        if len(values) > MAX_ELEMENTS:
+        # Elements of an array that become signals; images and point clouds have more.
+        if len(values) > 64:
             self.skip(name, f"an array of {len(values)} elements")
             return
         for place, value in enumerate(values):

@@ -14,9 +14,6 @@ from retwin.data.logs.signals import NO_STAMP, Log
 from retwin.data.tables import TIMES
 from retwin.serialisation.configs import toml_text
 
-MAX_LISTED = 200
-"""Signals that are listed in comments."""
-
 
 @dataclass(frozen=True)
 class Fact:
@@ -102,6 +99,7 @@ def mapping_text(
     )
     made.filters |= {"comment": _comment, "seen": _describe, "toml": _value}
     template = resources.files(__package__).joinpath("mapping.toml.j2").read_text("utf-8")
+    # Signals that are listed in comments.
     text = made.from_string(template).render(
         log=log,
         draft=draft,
@@ -115,7 +113,7 @@ def mapping_text(
         by_unit=by_unit,
         rest=[each for each in facts if each.name not in used],
         skipped=[pair for pair in log.skipped.items() if pair[1] not in (TIMES, NO_STAMP)],
-        listed=MAX_LISTED,
+        listed=200,
     )
     # A line that holds a dash is an empty one; others were left by the template.
     lines = filter(None, text.split("\n"))

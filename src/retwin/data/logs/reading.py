@@ -46,13 +46,10 @@ def log_format(path: Path) -> str:
     fine = is_log(path)
     regular = path.is_file() or path.is_dir()
     names = ", ".join(f"*{suffix}" for suffix in LOGS if suffix)
-    require(
-        fine and regular,
-        str(path),
-        expected=f"a log, {names}, or the folder of a ROS 2 bag",
-        got="no such file" if not path.exists() else "another kind of file",
-        remedy="check the name, or convert the log to one of these",
-    )
+    expected = f"a log, {names}, or the folder of a ROS 2 bag"
+    got = "no such file" if not path.exists() else "another kind of file"
+    remedy = "check the name, or convert the log to one of these"
+    require(fine and regular, str(path), expected=expected, got=got, remedy=remedy)
     return "" if path.is_dir() else path.suffix.lower()
 
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from retwin.checks import needs_extra, require
 from retwin.errors import InputError, brief
 
-LONGEST = 40
-"""Characters of a unit at most."""
 SAFE = re.compile(r"[\w°µμΩ%²³⁰¹⁴-⁹⁻·*/^ ().+-]*")
 POWER_OF_NUMBER = re.compile(r"[\d)]\s*(\*\*|\^)")
 """Powers of numbers and of brackets, whose evaluation may never end; units need none."""
@@ -131,12 +129,10 @@ def converted(values: NDArray, source: str, target: str, where: str) -> NDArray:
     offset, slope = float(ends[0]), float(ends[1] - ends[0])
     # Every unit of pint that is no logarithm is a line; the others are refused.
     line = np.isclose(ends[2], offset + 2 * slope, rtol=1e-9, atol=1e-300)
+    expected = f"a unit that is converted to {target!r}, and no logarithm"
+    got = repr(source)
     require(
-        np.isfinite(ends).all() and slope and line,
-        where,
-        expected=f"a unit that is converted to {target!r}, and no logarithm",
-        got=repr(source),
-        remedy=remedy,
+        np.isfinite(ends).all() and slope and line, where, expected=expected, got=got, remedy=remedy
     )
     return offset + slope * values
 
@@ -145,7 +141,8 @@ def _unit(text: str) -> Any:
     text = SPELT.get(text.strip(), text.strip())
     for pattern, spelt in RULES:
         text = pattern.sub(spelt, text)
-    if len(text) > LONGEST or not SAFE.fullmatch(text) or POWER_OF_NUMBER.search(text):
+    # Characters of a unit at most.
+    if len(text) > 40 or not SAFE.fullmatch(text) or POWER_OF_NUMBER.search(text):
         raise ValueError("what is no unit")
     return _registry().Unit("" if text.lower() in NONE else text)
 

@@ -15,8 +15,6 @@ FAR, AGAIN = 3.0, 1.5
 that of jumps to one value, again and again."""
 SHORT = 3
 """Samples of a spike at most, and jumps to one value from which on they are dropouts."""
-LONG = 0.05
-"""Share of a record that a dropout lasts, at most."""
 ALIKE = 1 / 3
 """Distance of the values before and after a jump over its size, at most."""
 
@@ -67,7 +65,8 @@ def _excursions(place: int, each: Readings, *, distinct: int = 10) -> NDArray:
         for n in range(1, SHORT + 1)
         for t in [np.arange(1, len(y) - n)]
     ]
-    long = np.diff(each.stretches)[:, 0] <= LONG * len(y)
+    # Share of a record that a dropout lasts, at most.
+    long = np.diff(each.stretches)[:, 0] <= 0.05 * len(y)
     inside = (each.stretches[:, 0] > 0) & (each.stretches[:, 1] < len(y))
     both = np.concatenate([*pairs, each.stretches[long & inside]])
     # As one number each, of which equal ones are found in a tenth of the time.

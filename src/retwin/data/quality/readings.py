@@ -14,8 +14,6 @@ from retwin.data.trajectories import Trajectories
 
 MOVED = 0.1
 """Share of the range of a command, or of an ideal output, from which it counts as moved."""
-SHORTEST = 3
-"""Samples of one value from which on they are a stretch of interest."""
 SAMPLES = 20
 """Samples of a record below which nothing is judged."""
 
@@ -71,7 +69,8 @@ class Readings:
         if not moving.any():
             return found
         drive, limit = self.drive[:, moving], MOVED * self.span[moving]
-        for place in np.flatnonzero(np.diff(self.stretches)[:, 0] >= SHORTEST).tolist():
+        # Samples of one value from which on they are a stretch of interest.
+        for place in np.flatnonzero(np.diff(self.stretches)[:, 0] >= 3).tolist():
             start, end = self.stretches[place].tolist()
             moved = np.abs(drive[start:end] - drive[start]) > limit
             if moved.any(axis=0).all():

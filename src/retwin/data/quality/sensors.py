@@ -15,12 +15,6 @@ from retwin.data.quality.finding import Finding
 from retwin.data.quality.readings import MOVED, WINDOW, Readings, readings_of
 from retwin.data.trajectories import Trajectories
 
-FLOOR = 1e-5
-"""Noise over the range of an output from which it is that of a sensor, and no rounding."""
-RELATED = 0.5
-"""Correlation from one sample to the next from which on motion is no noise."""
-
-
 CONSTANT = "never changes"
 """What is wrong with an output that has one value in all records."""
 LIMIT = "limit"
@@ -112,7 +106,7 @@ def _unusual(each: Readings, usual: float, *, noisy: bool, longer: float = 5.0) 
     return values[found].tolist()
 
 
-def _noisy(every: Sequence[Readings], *, noisy: float = 0.8) -> bool:
+def _noisy(every: Sequence[Readings], *, noisy: float = 0.8, floor: float = 1e-5) -> bool:
     """Whether an output shows noise wherever it is not still, so that stillness is no rest.
 
     The value that lasts longest in a record does not count: it is what is asked about.
@@ -121,6 +115,8 @@ def _noisy(every: Sequence[Readings], *, noisy: float = 0.8) -> bool:
     ----------
     noisy : float, default 0.8
         Share of the windows with noise from which it is expected everywhere.
+    floor : float, default 1e-5
+        Noise over the range of an output from which it is that of a sensor, and no rounding.
 
     """
     expected, found = 0, []
@@ -133,11 +129,18 @@ def _noisy(every: Sequence[Readings], *, noisy: float = 0.8) -> bool:
     if len(noise) < max(1, noisy * expected) or len(values) < 2:
         return False
     resolution = max(np.diff(values).min(), 4 * np.spacing(np.float32(np.abs(values).max())))
-    return bool(np.median(noise) > max(FLOOR * (values[-1] - values[0]), resolution))
+    return bool(np.median(noise) > max(floor * (values[-1] - values[0]), resolution))
 
 
-def find_noise(every: Sequence[Readings]) -> Iterator[Finding]:
-    """Records in which an output is white noise, although what drives it moves."""
+def find_noise(every: Sequence[Readings], *, correlated: float = 0.5) -> Iterator[Finding]:
+    """Records in which an output is white noise, although what drives it moves.
+
+    Parameters
+    ----------
+    correlated : float, default 0.5
+        Correlation from one sample to the next from which on motion is no noise.
+
+    """
     related = [_next(each.values) for each in every]
     for place, each in enumerate(every):
         moving = np.ptp(each.drive, axis=0) > 3 * MOVED * each.span
@@ -147,7 +150,7 @@ def find_noise(every: Sequence[Readings]) -> Iterator[Finding]:
         others = related[:place] + related[place + 1 :]
         motion = max(map(_next, drive.T)) if each.ideal or not others else np.median(others)
         limit = 4 / np.sqrt(each.size)
-        if motion > RELATED and abs(related[place]) < limit and not _follows(each, drive, limit):
+        if motion > correlated and abs(related[place]) < limit and not _follows(each, drive, limit):
             text = "white noise, on which nothing that was commanded has an effect"
             yield each.finding("noise", text, 0, each.size)
 

@@ -12,16 +12,9 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Chain, CommandSpace, Context, DelayOffset, before_sensor
-from retwin.update.corrections.warp import gather_samples
+from retwin.update.corrections.delays import gather_samples
 from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
-
-MAX_EARLY = 0.5
-"""Share of draws at most whose delay is before the command; they get none."""
-NO_CHANGE = 1e-6
-"""Largest change of a command, relative to its range, that counts as none, as in `Segments`."""
-STILL = 1e-9
-"""Spread of targets, relative to their size, below which no gain can be estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +46,18 @@ class Draws:
     early: float
 
 
-def still_and_fastest(commands: NDArray) -> tuple[NDArray, NDArray]:
-    """The largest changes by one sample (d_u,) that count as none, and that are in `commands`."""
+def still_and_fastest(commands: NDArray, *, no_change: float = 1e-6) -> tuple[NDArray, NDArray]:
+    """The largest changes by one sample (d_u,) that count as none, and that are in `commands`.
+
+    Parameters
+    ----------
+    no_change : float, default 1e-6
+        Largest change of a command, relative to its range, that counts as none, as in `Segments`.
+
+    """
     low, high = commands.min(axis=(0, 1)), commands.max(axis=(0, 1))
     change: NDArray = np.abs(np.diff(commands, axis=1)).max(axis=(0, 1))
-    return NO_CHANGE * np.where(high > low, high - low, 1), change
+    return no_change * np.where(high > low, high - low, 1), change
 
 
 def causal_part(
@@ -79,18 +79,12 @@ def causal_part(
 
     """
     other = "export it as an FMU: retwin export fmu"
-    _refuse(
-        not isinstance(twin, CorrectedTwin),
-        f"{type(twin).__name__}, which has no correction that an actuator executes",
-        other,
-    )
+    got = f"{type(twin).__name__}, which has no correction that an actuator executes"
+    _refuse(not isinstance(twin, CorrectedTwin), got, other)
     assert isinstance(twin, CorrectedTwin)
     residual, operator = twin.residual, before_sensor(twin.residual.correction)
-    _refuse(
-        isinstance(operator, Chain),
-        "a Chain of operators: what stands behind the actuators is no actuator",
-        "fit one of CommandSpace and DelayOffset",
-    )
+    got = "a Chain of operators: what stands behind the actuators is no actuator"
+    _refuse(isinstance(operator, Chain), got, "fit one of CommandSpace and DelayOffset")
     _refuse(
         not isinstance(residual, ResidualModel)
         or type(operator) not in (CommandSpace, DelayOffset),
@@ -117,11 +111,9 @@ def _check_outputs(twin: CorrectedTwin) -> None:
         "not positions or torques of actuators",
         "fit CommandSpace, which finds what the actuators executed",
     )
-    _refuse(
-        not (isinstance(twin.surrogate, Surrogate) and twin.surrogate.memoryless),
-        "DelayOffset with a twin or a network that remembers, in place of an MLP",
-        "fit the surrogate with an MLP, or CommandSpace, or export it as an FMU",
-    )
+    got = "DelayOffset with a twin or a network that remembers, in place of an MLP"
+    remedy = "fit the surrogate with an MLP, or CommandSpace, or export it as an FMU"
+    _refuse(not (isinstance(twin.surrogate, Surrogate) and twin.surrogate.memoryless), got, remedy)
 
 
 def _refuse(wrong: bool, got: str, remedy: str) -> None:
@@ -164,11 +156,9 @@ def drawn(
         gain = torch.zeros_like(gain)  # its offsets change with time, not with the distance covered
     centre = target.mean(dim=0)
     early = float((z[:, 0] < 0).double().mean())
-    _refuse(
-        early > MAX_EARLY,
-        f"delays of which {early:.0%} are before the command",
-        "check the clocks of commands and outputs",
-    )
+    got = f"delays of which {early:.0%} are before the command"
+    # Share of draws at most whose delay is before the command; they get none.
+    _refuse(early > 0.5, got, "check the clocks of commands and outputs")
     missed = mean[segment, 1 + width :]
     return Draws(
         delay=z[:, :1].clamp_min(0) / twin.rate,
@@ -190,10 +180,17 @@ def _targets(context: Context, operator: CommandSpace | DelayOffset) -> Tensor:
     return gather_samples(values, settle)
 
 
-def _slopes(target: Tensor, mean: Tensor) -> Tensor:
-    """Least-squares slopes (d,) of each column of `mean` (m, d) in that of `target` (m, d)."""
+def _slopes(target: Tensor, mean: Tensor, *, still: float = 1e-9) -> Tensor:
+    """Least-squares slopes (d,) of each column of `mean` (m, d) in that of `target` (m, d).
+
+    Parameters
+    ----------
+    still : float, default 1e-9
+        Spread of targets, relative to their size, below which no gain can be estimated.
+
+    """
     x, y = target.double(), mean.double()
     x, y = x - x.mean(dim=0), y - y.mean(dim=0)
     power = x.square().sum(dim=0)
-    least = STILL * target.double().square().sum(dim=0)
+    least = still * target.double().square().sum(dim=0)
     return torch.where(power > least, (x * y).sum(dim=0) / power.clamp_min(1e-300), 0.0).float()

@@ -27,8 +27,6 @@ from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import DelayOffset
 from retwin.update.surrogate import Surrogate
 
-MAX_DRAWS = 10_000_000
-"""Draws of z at most: more would not fit in memory beside a simulation."""
 DATE = (1980, 1, 1, 0, 0, 0)
 """The date of the parts of a file: the same twin gives the same bytes."""
 EXAMPLES, STEPS = 3, 40
@@ -118,7 +116,8 @@ def export_actuator(
 
     """
     twin, operator = causal_part(twin)
-    whole("draws", draws, at_least=1, at_most=MAX_DRAWS)
+    # Draws of z at most: more would not fit in memory beside a simulation.
+    whole("draws", draws, at_least=1, at_most=10_000_000)
     seed = checked_seed(seed)
     period = 1 / twin.rate if period is None else positive("period", period, unit="s")
     files = ["model.json", "weights.safetensors", "actuator.pt", *(["actuator.onnx"] * onnx)]

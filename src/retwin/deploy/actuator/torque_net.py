@@ -28,9 +28,6 @@ from retwin.serialisation.places import check_place
 from retwin.twins.twin import Twin, checked_commands, checked_seed
 from retwin.update.surrogate import fit_surrogate
 
-MAX_HISTORY = 1000
-"""Steps into the past at most."""
-
 
 @dataclass(frozen=True)
 class Joint:
@@ -167,7 +164,8 @@ def _require(right: bool, what: str, expected: str, got: str, remedy: str) -> No
 
 
 def _history(history: Sequence[int]) -> tuple[int, ...]:
-    lags = tuple(int(finite("history", each, at_least=0, at_most=MAX_HISTORY)) for each in history)
+    # Steps into the past at most.
+    lags = tuple(int(finite("history", each, at_least=0, at_most=1000)) for each in history)
     right = bool(lags) and len(set(lags)) == len(lags) and lags == tuple(history)
     _require(right, "history", "steps into the past, each once", str(history), "give (0, 1, 2)")
     return lags
@@ -180,26 +178,19 @@ def _places(twin: Twin, joint: Joint) -> tuple[int, int, int, int | None]:
     torque = _place(twin.outputs, "torque", joint.torque)
     velocity = _place(twin.outputs, "velocity", joint.velocity) if joint.velocity else None
     commanded, reached = twin.inputs.units[target], twin.outputs.units[position]
-    _require(
-        commanded == reached,
-        "joints",
-        f"a position in the unit of its target, {commanded!r}",
-        repr(reached),
-        "convert one of them in the twin",
-    )
+    expected = f"a position in the unit of its target, {commanded!r}"
+    got = repr(reached)
+    _require(commanded == reached, "joints", expected, got, "convert one of them in the twin")
     return target, position, torque, velocity
 
 
 def _place(channels: Channels, role: str, name: str) -> int:
     """Where the channel is that has a role in a joint."""
-    _require(
-        name in channels.names,
-        "joints",
-        f"a {role} among {', '.join(channels.names)}",
-        f"{name!r}, which the twin has not",
-        "an actuator net needs torques of the machine; without them, export_actuator gives "
-        "effective position targets, which need none",
-    )
+    expected = f"a {role} among {', '.join(channels.names)}"
+    got = f"{name!r}, which the twin has not"
+    remedy = "an actuator net needs torques of the machine; without them, export_actuator gives "
+    remedy += "effective position targets, which need none"
+    _require(name in channels.names, "joints", expected, got, remedy)
     return channels.names.index(name)
 
 

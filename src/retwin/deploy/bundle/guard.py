@@ -42,10 +42,6 @@ NETWORK = CNN(channels=(32, 64), dropout=0.1)
 """The network of the energy: two classes need a smaller one than a diagnoser."""
 TRAINING = Training(max_epochs=15, batch_size=64, learning_rate=3e-3, weight_decay=1e-2)
 """Settings of its training, unless others are given."""
-ENERGY_QUANTILE = 0.99
-"""Share of held-out generated trajectories whose energy is within the limit."""
-MISMATCH_FACTOR = 2.0
-"""Limit of the nominal mismatch, in multiples of the largest one of calibration trajectories."""
 MIN_MISMATCH = 0.05
 """Smallest limit of the nominal mismatch, in standard deviations of the nominal output."""
 MIN_ODDS = 10.0
@@ -59,10 +55,6 @@ LOG_BEND_SCALE = (-0.5, 0.7)
 
 It was chosen after scores of set A were known, see benchmarks/results/diagnosis.md.
 """
-MAX_KNOTS = 10
-"""Greatest number of random levels of a bend."""
-TRAJECTORIES_PER_BATCH = 256
-"""Trajectories whose energy is computed together; it bounds the memory of activations."""
 
 
 class Guard(nn.Module):
@@ -98,9 +90,16 @@ class Guard(nn.Module):
         return self.network(self.before(features))[:, 0]
 
     @torch.no_grad()
-    def energy(self, trajectories: Trajectories) -> NDArray:
-        """Energies (n,) of trajectories; InputError for other output channels or another rate."""
-        batches = self.features(trajectories).split(TRAJECTORIES_PER_BATCH)
+    def energy(self, trajectories: Trajectories, *, trajectories_per_batch: int = 256) -> NDArray:
+        """Energies (n,) of trajectories; InputError for other output channels or another rate.
+
+        Parameters
+        ----------
+        trajectories_per_batch : int, default 256
+            Trajectories whose energy is computed together; it bounds the memory of activations.
+
+        """
+        batches = self.features(trajectories).split(trajectories_per_batch)
         return torch.cat([self(batch) for batch in batches]).double().numpy()
 
     def stride(self, surrogate: Surrogate) -> int:
@@ -171,6 +170,8 @@ def fit_guard(
     count: int = 1800,
     training: Training = TRAINING,
     progress: Progress | None = None,
+    energy_quantile: float = 0.99,
+    mismatch_factor: float = 2.0,
 ) -> Guard:
     """Fit the energy to trajectories that the twin generates, and set all limits.
 
@@ -195,6 +196,10 @@ def fit_guard(
         Settings of the energy's training.
     progress : callable, optional
         Called with the share that is done.
+    energy_quantile : float, default 0.99
+        Share of held-out generated trajectories whose energy is within the limit.
+    mismatch_factor : float, default 2.0
+        Limit of the nominal mismatch, in multiples of the largest one of calibration trajectories.
 
     Returns
     -------
@@ -220,8 +225,8 @@ def fit_guard(
     with isolated(seed):
         guard = Guard(NETWORK, features, Domain.around([made, healthy]))
     guard.fitted = _train(guard, features(training_part), training, seed, progress)
-    limit = np.quantile(guard.energy(held_out), ENERGY_QUANTILE, method="higher")
-    mismatch = MISMATCH_FACTOR * guard.mismatch(twin.surrogate, healthy).max()
+    limit = np.quantile(guard.energy(held_out), energy_quantile, method="higher")
+    mismatch = mismatch_factor * guard.mismatch(twin.surrogate, healthy).max()
     guard.domain = replace(
         guard.domain,
         mismatch=float(max(mismatch, MIN_MISMATCH)),
@@ -246,12 +251,18 @@ def _train(
     return train(guard, loss, (plausible,), None, training, seed=seed, progress=progress)
 
 
-def implausible(features: Tensor, generator: torch.Generator) -> Tensor:
+def implausible(features: Tensor, generator: torch.Generator, *, max_knots: int = 10) -> Tensor:
     """Features (b, T', 2 d_y) with the same nominal paths and implausible outputs.
 
     For each trajectory one of three kinds is drawn: the outputs of the next trajectory of the
     batch; a random walk over the range of the outputs; its own outputs plus a curve through up to
     ten random levels.
+
+    Parameters
+    ----------
+    max_knots : int, default 10
+        Greatest number of random levels of a bend.
+
     """
     nominal, residual = features.chunk(2, dim=-1)
     observed = nominal + residual
@@ -266,7 +277,7 @@ def implausible(features: Tensor, generator: torch.Generator) -> Tensor:
     walk = normal(count, steps, width).cumsum(dim=1)
     walk = walk / walk.abs().amax(dim=1, keepdim=True) * uniform(0.0, 2.0)
     wandering = observed.mean(dim=(0, 1)) + walk * observed.std(dim=(0, 1), correction=0)
-    knots = int(torch.randint(1, MAX_KNOTS + 1, (1,), generator=generator))
+    knots = int(torch.randint(1, max_knots + 1, (1,), generator=generator))
     bend = nn.functional.interpolate(normal(count, width, knots), size=steps, mode="linear")
     bend = bend.transpose(1, 2) * residual.std(dim=(0, 1), correction=0)
     bent = observed + uniform(*LOG_BEND_SCALE).exp() * bend

@@ -27,16 +27,8 @@ CHECKS = (
 """Names of the checks, in the order of their scores; the last checks the diagnoser's output."""
 COMMANDS, OUTPUTS = ("low", "high", "speed"), ("floor", "ceiling", "spread")
 """Fields of `Domain` that have one number per command, and per output."""
-MISSING_LIMIT = 0.25
-"""Limit of the share of missing measurements."""
-LENGTH_LIMIT = 2.0
-"""Limit of the ratio between a trajectory's length and that of the bundle's, or its inverse."""
 OUTSIDE = 10.0
 """Score, in multiples of a check's limit, above which a trajectory is outside."""
-SUM_TOLERANCE = 1e-3
-"""Greatest difference from 1 of the sum of probabilities, far above the rounding of float32."""
-MAX_LOG_ODDS = 50.0
-"""Bound of the log odds before `exp`, far beyond every limit and below any overflow."""
 
 Function = Callable[[Trajectories], NDArray]
 """Function of n trajectories to numbers (n,) or (n, k)."""
@@ -177,14 +169,12 @@ class Domain:
             widths = [np.subtract(self.high, self.low), np.subtract(self.ceiling, self.floor)]
         numbers = [getattr(self, each.name) for each in fields(self)]
         sizes = [*widths, self.speed, self.spread, self.mismatch]
-        require(
-            all(np.isfinite(each).all() for each in [*numbers, *widths])
-            and all(np.greater_equal(each, 0).all() for each in sizes),
-            "domain",
-            expected="finite ranges and limits, none of them negative",
-            got=self,
-            remedy="make the bundle and its export anew",
+        sound = all(np.isfinite(each).all() for each in [*numbers, *widths]) and all(
+            np.greater_equal(each, 0).all() for each in sizes
         )
+        expected = "finite ranges and limits, none of them negative"
+        remedy = "make the bundle and its export anew"
+        require(sound, "domain", expected=expected, got=self, remedy=remedy)
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Domain:
@@ -221,6 +211,7 @@ class Domain:
         energy: Function,
         *,
         steps: int | None = None,
+        max_log_odds: float = 50.0,
     ) -> Verdicts:
         """Score trajectories in all checks but the last.
 
@@ -236,6 +227,8 @@ class Domain:
             check before has found outside.
         steps : int, optional
             Samples of the trajectories that the bundle was made for; by default any number.
+        max_log_odds : float, default 50.0
+            Bound of the log odds before `exp`, far beyond every limit and below any overflow.
 
         Raises
         ------
@@ -261,7 +254,7 @@ class Domain:
         def residual(some: Trajectories) -> NDArray:
             # Energies are log odds, so this is the ratio of the odds to those at the limit.
             energies = energy(some)
-            odds = np.exp(np.clip(energies - self.energy, -MAX_LOG_ODDS, MAX_LOG_ODDS))
+            odds = np.exp(np.clip(energies - self.energy, -max_log_odds, max_log_odds))
             return np.where(np.isfinite(energies), odds, np.inf)
 
         # What overflows is not finite, and what is not finite is outside.
@@ -283,13 +276,15 @@ class Domain:
         # The limit of nominal outputs is their mismatch. Excluded here is only what would overflow:
         # more than a whole range beyond the range of the observed outputs.
         far = _excess(trajectories.nominal, self.floor, self.ceiling) > 1 / TOLERANCE
+        # Limit of the share of missing measurements.
+        # Limit of the ratio between a trajectory's length and that of the bundle's, or its inverse.
         return {
             "commands": _excess(trajectories.commands, self.low, self.high),
             "speed": _excess(speed[:, None], np.zeros(len(self.speed)), self.speed),
             "outputs": _excess(trajectories.observed, self.floor, self.ceiling, trajectories.mask),
             "nominal": np.where(far, np.inf, 0.0),
-            "missing": np.where(measured > 0, (1 - measured) / MISSING_LIMIT, np.inf),
-            "length": np.full(len(trajectories), ratio / LENGTH_LIMIT),
+            "missing": np.where(measured > 0, (1 - measured) / 0.25, np.inf),
+            "length": np.full(len(trajectories), ratio / 2.0),
         }
 
 
@@ -310,10 +305,17 @@ def _subset(trajectories: Trajectories, rows: NDArray) -> Trajectories:
     return trajectories if rows.all() else trajectories[rows]
 
 
-def are_probabilities(values: NDArray) -> NDArray:
-    """Flags (n,) of the rows (n, classes) that are between 0 and 1 and sum to 1; NaN is false."""
+def are_probabilities(values: NDArray, *, sum_tolerance: float = 1e-3) -> NDArray:
+    """Flags (n,) of the rows (n, classes) that are between 0 and 1 and sum to 1; NaN is false.
+
+    Parameters
+    ----------
+    sum_tolerance : float, default 1e-3
+        Greatest difference from 1 of the sum of probabilities, far above the rounding of float32.
+
+    """
     between = np.all((values >= 0) & (values <= 1), axis=1)
-    return between & (np.abs(values.sum(axis=1) - 1) <= SUM_TOLERANCE)
+    return between & (np.abs(values.sum(axis=1) - 1) <= sum_tolerance)
 
 
 def _excess(values: NDArray, low: Any, high: Any, mask: NDArray | None = None) -> NDArray:

@@ -47,11 +47,9 @@ def surrogate_text(twin: Surrogate | CorrectedTwin, commands: NDArray | None = N
 
     """
     surrogate = twin if isinstance(twin, Surrogate) else twin.surrogate
-    _refuse(
-        not isinstance(surrogate, Surrogate),
-        "a twin in place of a surrogate, which is no network",
-        "fit a surrogate of it, or learn its state equations: fit_state_surrogate",
-    )
+    got = "a twin in place of a surrogate, which is no network"
+    remedy = "fit a surrogate of it, or learn its state equations: fit_state_surrogate"
+    _refuse(not isinstance(surrogate, Surrogate), got, remedy)
     inputs, outputs = len(surrogate.inputs), len(surrogate.outputs)
     network = c_network(surrogate.config, inputs, outputs)
     first, limits, ranged = _commands(surrogate)
@@ -122,17 +120,11 @@ def _per_sample(residual: Residual, rate: float) -> SequenceResidual:
         reason = "the errors of its samples have no C text"
         if every > 1:
             reason = "a record joins sampled values by straight lines: it depends on the next one"
-        _refuse(
-            every > 0,
-            f"{_named(correction)}: {reason}",
-            "fit the correction without SampledSensor, at the rate of the sensor",
-        )
+        remedy = "fit the correction without SampledSensor, at the rate of the sensor"
+        _refuse(every > 0, f"{_named(correction)}: {reason}", remedy)
         correction = before_sensor(correction)
-    _refuse(
-        type(correction) is not Additive,
-        f"{_named(correction)}, an operator that has no C text",
-        other,
-    )
+    got = f"{_named(correction)}, an operator that has no C text"
+    _refuse(type(correction) is not Additive, got, other)
     return residual
 
 

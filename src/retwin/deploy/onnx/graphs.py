@@ -13,8 +13,8 @@ from retwin.diagnosis import NetworkDiagnoser
 from retwin.diagnosis.trained.features import Features
 from retwin.nets.student import shared_factor
 from retwin.update.corrections import Context, Correction, SampledSensor, sensor_of
+from retwin.update.corrections.delays import gather_samples
 from retwin.update.corrections.tensor_segments import TensorSegments
-from retwin.update.corrections.warp import gather_samples
 from retwin.update.residual import ResidualModel
 from retwin.update.residual.model import describe
 from retwin.update.surrogate import Surrogate

@@ -41,9 +41,6 @@ SCHEMA = 2
 """The version of the plan's identity. Digests of the first, which has no such key, differ."""
 MAX_NPZ_BYTES = 2**29
 """Greatest size of an NPZ's arrays, which are held in memory."""
-COPIES = 3
-"""Arrays of a chunk that are in memory together: simulated, stored and packed. Zarr takes memory
-for a whole chunk, also where the last one is shorter."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +154,9 @@ class _Job:
         part = _part(target)
         if not part.exists():
             Budget("n", disk=target.parent).take(plan.count * plan.trajectory_bytes)
-            Budget("chunk").take(COPIES * plan.chunk * plan.trajectory_bytes)
+            # Arrays of a chunk that are in memory together: simulated, stored and packed. Zarr
+            # takes memory for a whole chunk, also where the last one is shorter.
+            Budget("chunk").take(3 * plan.chunk * plan.trajectory_bytes)
             with write_atomically(part, replace=False) as new:
                 (new / "done").mkdir(parents=True)
                 if isinstance(plan.commands, Recorded):

@@ -32,8 +32,6 @@ if TYPE_CHECKING:  # a worker that simulates without torch need not load it
 
 MAX_CHUNK = 2**31 - 1
 """Greatest number of trajectories in a chunk; the memory allows fewer of any length."""
-MAX_REASON_CHARACTERS = 200
-"""Greatest number of characters of a failure's reason; a header holds up to a million of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,8 +309,6 @@ def _simulated(
     for name, values in given.items():
         arrays[name][sound] = values[finite]
     assert tuple(arrays) == CHUNKED_NAMES
-    reasons = {
-        int(rows[0]) + i: " ".join(failed[i].split())[:MAX_REASON_CHARACTERS]
-        for i in sorted(failed)
-    }
+    # Greatest number of characters of a failure's reason; a header holds up to a million of them.
+    reasons = {int(rows[0]) + i: " ".join(failed[i].split())[:200] for i in sorted(failed)}
     return SimulatedChunk(arrays, reasons, made.emulated)

@@ -37,8 +37,6 @@ FROZEN = np.array([1e-2, 1e-4])
 """Standard deviations of a sensor that is frozen, in those of its noise in calibration. With all of
 that noise it would be the last sample that is held, which predicts a machine at rest better than a
 twin whose noise contains what it lacks."""
-SMALLEST = 0.1
-"""Smallest effect of parameters that counts: a change of the log density by 0.005 nats."""
 ROWS = 256
 """Simulations that are filtered together, which bounds memory."""
 
@@ -262,8 +260,15 @@ class FaultEvidence:
         """Those of the twin with its own noise."""
         return self._slopes((0.0, 0.0))
 
-    def _slopes(self, more: NoiseVariances) -> NDArray:
-        """Derivatives (T, d_y, r) of predictions by the parameters, along r directions."""
+    def _slopes(self, more: NoiseVariances, *, smallest: float = 0.1) -> NDArray:
+        """Derivatives (T, d_y, r) of predictions by the parameters, along r directions.
+
+        Parameters
+        ----------
+        smallest : float, default 0.1
+            Smallest effect of parameters that counts: a change of the log density by 0.005 nats.
+
+        """
         record = self.record
         given = (each[None] for each in (record.commands, record.measured, record.seen))
         made = self.twin.filter.slopes(*given, more=more, known_start=record.known_start)[0]
@@ -274,7 +279,7 @@ class FaultEvidence:
         if not np.isfinite(scaled).all():
             return made[..., :0]
         _, values, directions = np.linalg.svd(scaled, full_matrices=False)
-        return made @ directions[values > SMALLEST].T
+        return made @ directions[values > smallest].T
 
 
 def _digit(values: NDArray) -> float:

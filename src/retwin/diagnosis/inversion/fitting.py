@@ -100,13 +100,9 @@ def fit_inversion(
     """
     finite("false_rate", false_rate, at_least=0.001, at_most=0.5)
     if isinstance(surrogate, DynamicsTwin):
-        require(
-            residual is None,
-            "residual",
-            expected="None, since corrected dynamics have a distribution",
-            got=type(residual).__name__,
-            remedy="leave it out",
-        )
+        expected = "None, since corrected dynamics have a distribution"
+        got = type(residual).__name__
+        require(residual is None, "residual", expected=expected, got=got, remedy="leave it out")
         return StateInversionDiagnoser(surrogate, faults)
     if not isinstance(residual, ResidualModel):
         raise InputError(
@@ -121,13 +117,10 @@ def fit_inversion(
     remedy = "give those that the residual model was fitted to"
     calibration = instance("calibration", calibration, Trajectories, remedy=remedy)
     healthy = calibration.with_label(HEALTHY)
-    require(
-        len(healthy),
-        "calibration",
-        expected=f"at least one trajectory labelled {HEALTHY!r}",
-        got=f"labels {sorted(calibration.known_labels) or 'none'}",
-        remedy="label healthy trajectories",
-    )
+    expected = f"at least one trajectory labelled {HEALTHY!r}"
+    got = f"labels {sorted(calibration.known_labels) or 'none'}"
+    remedy = "label healthy trajectories"
+    require(len(healthy), "calibration", expected=expected, got=got, remedy=remedy)
     surrogate = exact_surrogate(surrogate)
     with training_checked(surrogate, healthy.commands):
         return _fit(surrogate, residual, healthy, faults, twin, false_rate)

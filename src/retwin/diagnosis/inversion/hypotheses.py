@@ -198,13 +198,10 @@ def _actuator_and_size(fault: Fault | None) -> tuple[int, tuple[float, float]]:
             return actuator, (0.0, 0.0)
         case ActuatorBias(actuator=actuator, size=(low, high), bias=()):
             return actuator, (low, high)
-    raise InputError(
-        "faults",
-        expected="None, Stuck, or ActuatorBias with its bias open",
-        got=repr(fault),
-        remedy="leave out what cannot be inverted, train a diagnoser, or correct the dynamics "
-        "(fit_dynamics, retwin fit --dynamics), by which every kind of fault is inverted",
-    )
+    expected = "None, Stuck, or ActuatorBias with its bias open"
+    remedy = "leave out what cannot be inverted, train a diagnoser, or correct the dynamics "
+    remedy += "(fit_dynamics, retwin fit --dynamics), by which every kind of fault is inverted"
+    raise InputError("faults", expected=expected, got=repr(fault), remedy=remedy)
 
 
 def _limits(

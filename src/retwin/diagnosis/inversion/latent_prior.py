@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from retwin.errors import InputError
-from retwin.inference.priors import GaussianPrior
+from retwin.inference.problem import GaussianPrior
 from retwin.nets.mixtures import Bernoullis, GaussianMixture
 from retwin.nets.student import Student
 from retwin.update.corrections import CommandSpace, Context, Correction, before_sensor
@@ -16,9 +16,6 @@ from retwin.update.corrections.commands.missed_segments import LatentPrior
 from retwin.update.corrections.commands.problem import CommandProblem
 from retwin.update.corrections.delay_range import range_in_samples
 from retwin.update.residual import ResidualModel
-
-DRAWS = 2000
-"""Draws from a distribution whose covariance has no closed form."""
 
 
 def command_space(correction: Correction) -> CommandSpace:
@@ -33,12 +30,9 @@ def command_space(correction: Correction) -> CommandSpace:
     operator = before_sensor(correction)
     if isinstance(operator, CommandSpace):
         return operator
-    raise InputError(
-        "residual",
-        expected="a residual model of the actuators' effective commands",
-        got=repr(correction),
-        remedy="fit it with CommandSpace(), or with a Chain of it and a SampledSensor()",
-    )
+    expected = "a residual model of the actuators' effective commands"
+    remedy = "fit it with CommandSpace(), or with a Chain of it and a SampledSensor()"
+    raise InputError("residual", expected=expected, got=repr(correction), remedy=remedy)
 
 
 def command_problem(
@@ -86,8 +80,15 @@ def healthy_prior(residual: ResidualModel, context: Context) -> LatentPrior:
     return LatentPrior(gaussian, cast(Bernoullis, missed).logits.double())
 
 
-def _covariance(distribution: Any) -> Tensor:
-    """Covariance (..., D, D) of a block of z, double precision; without a formula, from draws."""
+def _covariance(distribution: Any, *, draws: int = 2000) -> Tensor:
+    """Covariance (..., D, D) of a block of z, double precision; without a formula, from draws.
+
+    Parameters
+    ----------
+    draws : int, default 2000
+        Draws from a distribution whose covariance has no closed form.
+
+    """
     if isinstance(distribution, Student):
         return _covariance(distribution.normal)
     if isinstance(distribution, GaussianMixture):
@@ -98,9 +99,9 @@ def _covariance(distribution: Any) -> Tensor:
     shape, (size,) = distribution.batch_shape, distribution.event_shape
     generator = torch.Generator().manual_seed(0)
     # The same noise for every segment: the prior of one does not depend on the others.
-    noise = torch.rand(DRAWS, generator=generator), torch.randn(DRAWS, size, generator=generator)
-    rows = (each.reshape(DRAWS, *[1] * len(shape), -1) for each in noise)
-    uniform, normal = (each.expand(DRAWS, *shape, -1) for each in rows)
-    drawn = distribution.expand((DRAWS, *shape)).from_noise(uniform[..., 0], normal).double()
+    noise = torch.rand(draws, generator=generator), torch.randn(draws, size, generator=generator)
+    rows = (each.reshape(draws, *[1] * len(shape), -1) for each in noise)
+    uniform, normal = (each.expand(draws, *shape, -1) for each in rows)
+    drawn = distribution.expand((draws, *shape)).from_noise(uniform[..., 0], normal).double()
     away = drawn - drawn.mean(dim=0)
-    return torch.einsum("k...i,k...j->...ij", away, away) / (DRAWS - 1)
+    return torch.einsum("k...i,k...j->...ij", away, away) / (draws - 1)

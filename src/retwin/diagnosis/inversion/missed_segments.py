@@ -12,8 +12,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from retwin.inference.losses import StudentT
-from retwin.inference.noise import Noise, predicted_variance
+from retwin.inference.noise import Noise, StudentT, predicted_variance
 from retwin.update.corrections.commands.missed_segments import (
     MARGIN,
     SEARCHES,
@@ -23,9 +22,6 @@ from retwin.update.corrections.commands.missed_segments import (
     searched,
 )
 from retwin.update.corrections.commands.problem import CommandProblem
-
-WORST = 2
-"""Segments of a row that one search may try as missed: the worst explained ones."""
 
 
 def best_fit(
@@ -75,7 +71,8 @@ def _suspects(
     best = torch.full((len(fit.x),), -torch.inf, dtype=torch.float64)
     best = best.scatter_reduce(0, trajectory, fit.evidence, "amax")
     hopeful = (bound > 0) & (fit.evidence[rows] + bound > best[trajectory[rows]] - MARGIN)
-    worst = (gain > 0) & (gain >= gain.topk(min(WORST, gain.shape[1]), dim=1).values[:, -1:])
+    # Segments of a row that one search may try as missed: the worst explained ones.
+    worst = (gain > 0) & (gain >= gain.topk(min(2, gain.shape[1]), dim=1).values[:, -1:])
     # Where next to nothing was to move nothing can be missed.
     moving = part.distance > 2 * part.per_segment(own.deviation)[..., 1:]
     chosen = hopeful[:, None, None] & (worst[..., None] | lasting) & moving & part.healthy

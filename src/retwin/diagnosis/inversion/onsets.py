@@ -18,8 +18,6 @@ from retwin.inference.problem import Rows
 from retwin.inference.solver import gauss_newton_step
 from retwin.update.corrections.commands.missed_segments import fitted
 
-COARSE = 25
-"""Onsets of each segment that are evaluated first."""
 FINE = 8
 """Samples before and after the best of them that are evaluated one by one."""
 
@@ -107,7 +105,7 @@ def _cells(samples: Tensor) -> Tensor:
 
 
 def _explain(
-    rows: Hypotheses, limits: Tensor, noise: Noise, *, passes: int = 2
+    rows: Hypotheses, limits: Tensor, noise: Noise, *, passes: int = 2, evaluated_first: int = 25
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Onsets (R, G) between limits, the log evidence of each times its cell; the best of them (R,),
     and its log evidence.
@@ -116,12 +114,14 @@ def _explain(
     ----------
     passes : int, default 2
         Times that the outputs are explained for the best onset.
+    evaluated_first : int, default 25
+        Onsets of each segment that are evaluated first.
 
     """
     first, last = (each[:, None] for each in limits.unbind(dim=1))
     empty = last < first
     last = last.maximum(first)
-    share = torch.linspace(0, 1, COARSE, dtype=torch.float64)
+    share = torch.linspace(0, 1, evaluated_first, dtype=torch.float64)
     samples = coarse = (first + (last - first) * share).round().long()
     x = rows.start
     objective = _objectives(rows, samples, x, None, noise)

@@ -20,8 +20,6 @@ from retwin.update.corrections.commands.missed_segments import CommandFit
 
 POINTS = 512
 """Points of the low-discrepancy set."""
-SMALLEST = 1e-300
-"""Probability below which an interval counts as empty."""
 
 
 def biases(rows: Hypotheses, fit: CommandFit, coverage: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -202,7 +200,8 @@ def _inside(
         # The upper tail is turned over: far out, only the lower one has digits left.
         upper = begin > 0
         left, right = torch.where(upper, -end, begin), torch.where(upper, -begin, end)
-        masses.append((ndtr(right) - ndtr(left)).clamp_min(SMALLEST))
+        # Probability below which an interval counts as empty.
+        masses.append((ndtr(right) - ndtr(left)).clamp_min(1e-300))
         shares.append((left, right, upper))
     total = masses[0] + masses[1]
     split = masses[0] / total

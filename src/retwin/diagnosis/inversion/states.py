@@ -104,21 +104,15 @@ class StateInversionDiagnoser:
     """
 
     def __init__(self, twin: DynamicsTwin, faults: Mapping[str, Fault | None]) -> None:
-        require(
-            len(faults) > 1 and sum(each is None for each in faults.values()) == 1,
-            "faults",
-            expected="one healthy class, None, and faults",
-            got=faults,
-            remedy='give for instance {"Healthy": None, "leak": ParameterShift(...)}',
-        )
+        complete = len(faults) > 1 and sum(each is None for each in faults.values()) == 1
+        expected = "one healthy class, None, and faults"
+        remedy = 'give for instance {"Healthy": None, "leak": ParameterShift(...)}'
+        require(complete, "faults", expected=expected, got=faults, remedy=remedy)
         for fault in faults.values():
-            require(
-                fault is None or isinstance(fault, TimedFault),
-                "faults",
-                expected=f"None, or one of {', '.join(each.__name__ for each in KINDS)}",
-                got=repr(fault),
-                remedy="leave out what cannot be inverted, or train a diagnoser",
-            )
+            invertible = fault is None or isinstance(fault, TimedFault)
+            expected = f"None, or one of {', '.join(each.__name__ for each in KINDS)}"
+            remedy = "leave out what cannot be inverted, or train a diagnoser"
+            require(invertible, "faults", expected=expected, got=repr(fault), remedy=remedy)
         check_faults(list(faults.values()), len(twin.inputs), len(twin.outputs), twin.shiftable)
         self.twin = twin
         self.classes = tuple(faults)
@@ -173,12 +167,10 @@ class StateInversionDiagnoser:
         found, dispersions = zip(*tracked(rows, len(single), progress), strict=True)
         evidence = np.array([[each.evidence for each in row] for row in found])
         if not np.isfinite(evidence).any(axis=1).all():
-            raise ImplausibleError(
-                "trajectories",
-                expected="outputs with which the filter stays finite",
-                got=f"{int((~np.isfinite(evidence).any(axis=1)).sum())} with which it does not",
-                remedy="check their units",
-            )
+            expected = "outputs with which the filter stays finite"
+            got = f"{int((~np.isfinite(evidence).any(axis=1)).sum())} with which it does not"
+            remedy = "check their units"
+            raise ImplausibleError("trajectories", expected=expected, got=got, remedy=remedy)
         parts = np.array([[(e.mean, e.low, e.high) for e in row[:-1]] for row in found])
         size, onset, end = (Estimate(*np.moveaxis(parts[..., k], 2, 0)) for k in range(3))
         top = evidence.max(axis=1, keepdims=True)
@@ -213,12 +205,10 @@ class StateInversionDiagnoser:
         record = FaultEvidence.of(self.twin, trajectory, known_start)
         error = record.largest_error()
         if not error < implausible:
-            raise ImplausibleError(
-                "trajectories",
-                expected="finite outputs that the twin's sensors could measure",
-                got=f"one {error:.1g} standard deviations away in {trajectory.ids[0]}",
-                remedy="check their units, and mask values that stand for missing ones",
-            )
+            expected = "finite outputs that the twin's sensors could measure"
+            got = f"one {error:.1g} standard deviations away in {trajectory.ids[0]}"
+            remedy = "check their units, and mask values that stand for missing ones"
+            raise ImplausibleError("trajectories", expected=expected, got=got, remedy=remedy)
         faults = self.faults.values()
         row = [record.integral(fault) for fault in faults]
         unknown = record.unknown(faults, row)

@@ -47,8 +47,6 @@ TRAJECTORIES_PER_BATCH = 16
 """Trajectories inverted together, which bounds memory."""
 UNEXPLAINED = "no class explains the outputs nearly as well as in calibration"
 """The reason for which a trajectory is unknown although it was measured."""
-PAIRS = 0.01
-"""Probability, beforehand, of two stuck actuators over that of a single fault or none."""
 COVERAGE = 0.9
 """Coverage of all intervals."""
 
@@ -227,11 +225,7 @@ class InversionDiagnoser:
     @torch.no_grad()
     @one_thread()
     def diagnose(
-        self,
-        trajectories: Trajectories,
-        *,
-        max_faults: int = 1,
-        progress: Progress | None = None,
+        self, trajectories: Trajectories, *, max_faults: int = 1, progress: Progress | None = None
     ) -> Diagnosis:
         """Probabilities and severities of every class; all classes are equally probable beforehand.
 
@@ -296,13 +290,10 @@ class InversionDiagnoser:
         """The pairs of stuck actuators that are tried, by the names of their classes."""
         one_of("max_faults", max_faults, (1, 2))
         pairs = stuck_pairs(self.faults) if max_faults > 1 else {}
-        require(
-            max_faults == 1 or len(pairs) > 0,
-            "max_faults",
-            expected="1 for a diagnoser without two actuators that can be stuck",
-            got=max_faults,
-            remedy="add their classes to its faults",
-        )
+        possible = max_faults == 1 or len(pairs) > 0
+        expected = "1 for a diagnoser without two actuators that can be stuck"
+        remedy = "add their classes to its faults"
+        require(possible, "max_faults", expected=expected, got=max_faults, remedy=remedy)
         return pairs
 
     def save(self, folder: str | Path) -> None:
@@ -340,11 +331,17 @@ FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 
 
 def _several(
-    evidence: NDArray, classes: int, pairs: Sequence[tuple[str, str]]
+    evidence: NDArray, classes: int, pairs: Sequence[tuple[str, str]], *, prior_odds: float = 0.01
 ) -> tuple[NDArray, NDArray]:
     """The probability (n,) that a pair is true, and a sentence with the most probable pair.
 
-    `evidence` (n, C + pairs); beforehand all pairs are `PAIRS` as probable as all C classes.
+    `evidence` (n, C + pairs); beforehand all pairs are `prior_odds` as probable as all C classes.
+
+    Parameters
+    ----------
+    prior_odds : float, default 0.01
+        Probability, beforehand, of two stuck actuators over that of a single fault or none.
+
     """
     if not pairs:
         return np.zeros(len(evidence)), np.full(len(evidence), "", dtype=object)
@@ -352,7 +349,7 @@ def _several(
     two = logsumexp(evidence[:, classes:], axis=1) - np.log(len(pairs))
     best = evidence[:, classes:].argmax(axis=1)
     text = [f"more than one fault: {' and '.join(pairs[i])} explain the outputs best" for i in best]
-    return expit(two - one + np.log(PAIRS)), np.array(text, dtype=object)
+    return expit(two - one + np.log(prior_odds)), np.array(text, dtype=object)
 
 
 def _offsets(rows: Hypotheses, found: Inversion, classes: int, healthy: int) -> NDArray:

@@ -115,13 +115,10 @@ class _Pair(nn.Module):
 
     def __init__(self, diagnoser: NetworkDiagnoser, hidden: int) -> None:
         super().__init__()
-        require(
-            hasattr(diagnoser.network, "represent"),
-            "network",
-            expected="a classifier that represents a trajectory: CNN or LSTMClassifier",
-            got=type(diagnoser.config).__name__,
-            remedy="choose one of these",
-        )
+        represents = hasattr(diagnoser.network, "represent")
+        expected = "a classifier that represents a trajectory: CNN or LSTMClassifier"
+        got = type(diagnoser.config).__name__
+        require(represents, "network", expected=expected, got=got, remedy="choose one of these")
         self.diagnoser = diagnoser
         width = self._network.readout.in_features
         self.critic = nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, 1))

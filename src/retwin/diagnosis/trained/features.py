@@ -22,9 +22,6 @@ SETTLED = 2
 delay of the response, and one because a value interpolated between two sensor samples depends on
 the earlier one."""
 
-KEPT = 100
-"""Samples of a trajectory that the features keep at least, unless their rate is given: a trajectory
-in some detail, while a network with memory learns in minutes."""
 MAX_STRIDE = 10**6
 """The largest stride that is read from a file, so that its phases fit the memory."""
 
@@ -85,7 +82,9 @@ class Features:
         """
         steps = trajectories.steps
         if rate is None:
-            stride = min(max(1, steps // KEPT), MAX_STRIDE)
+            # Samples of a trajectory that the features keep at least, unless their rate is given: a
+            # trajectory in some detail, while a network with memory learns in minutes.
+            stride = min(max(1, steps // 100), MAX_STRIDE)
         else:
             stride = stride_of(trajectories.rate, rate, steps=steps)
         return cls(trajectories.outputs, trajectories.rate, stride, hide_start)

@@ -71,13 +71,10 @@ def fit_diagnoser(
     remedy = "load recorded ones, or simulate a twin"
     instance("trajectories", trajectories, Trajectories, remedy=remedy)
     adapts = isinstance(classifier, Method) and classifier.adapts
-    require(
-        (target is not None) == adapts,
-        "target",
-        expected=f"{'real trajectories' if adapts else 'none'} for {type(classifier).__name__}",
-        got="none" if target is None else f"{len(target)} trajectories",
-        remedy="give real trajectories to DANN and FineTune, and to no other classifier",
-    )
+    expected = f"{'real trajectories' if adapts else 'none'} for {type(classifier).__name__}"
+    got = "none" if target is None else f"{len(target)} trajectories"
+    remedy = "give real trajectories to DANN and FineTune, and to no other classifier"
+    require((target is not None) == adapts, "target", expected=expected, got=got, remedy=remedy)
     task = TrainingTask(trajectories, target, seed, classes, rate, training, progress)
     if isinstance(classifier, Method):
         return classifier.fit(task)

@@ -53,13 +53,11 @@ class PooledDiagnoser:
 
     def __init__(self, members: Sequence[Diagnoser]) -> None:
         self.members = tuple(members)
-        require(
-            len({tuple(sorted(member.classes)) for member in self.members}) == 1,
-            "members",
-            expected="one diagnoser or more, all of the same classes",
-            got=[member.classes for member in self.members],
-            remedy="fit all of them with the classes of one case",
-        )
+        alike = len({tuple(sorted(member.classes)) for member in self.members}) == 1
+        expected = "one diagnoser or more, all of the same classes"
+        got = [member.classes for member in self.members]
+        remedy = "fit all of them with the classes of one case"
+        require(alike, "members", expected=expected, got=got, remedy=remedy)
         self.classes = self.members[0].classes
 
     def predict_proba(self, trajectories: Trajectories) -> NDArray:

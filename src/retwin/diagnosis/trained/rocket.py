@@ -87,13 +87,11 @@ class Rocket:
         )
         order = class_order(trajectories, task.classes)
         features = Features.at(trajectories, task.rate)
-        require(
-            trajectories.steps > (KERNEL_LENGTH - 1) * features.stride,
-            "rate",
-            expected=f"at least {KERNEL_LENGTH} samples per trajectory, the length of a kernel",
-            got=f"{-(-trajectories.steps // features.stride)} samples",
-            remedy="choose a higher rate or give longer trajectories",
-        )
+        enough = trajectories.steps > (KERNEL_LENGTH - 1) * features.stride
+        expected = f"at least {KERNEL_LENGTH} samples per trajectory, the length of a kernel"
+        got = f"{-(-trajectories.steps // features.stride)} samples"
+        remedy = "choose a higher rate or give longer trajectories"
+        require(enough, "rate", expected=expected, got=got, remedy=remedy)
         fitted_on, held_out = trajectories.split(0.8, seed=task.seed)
         before = Standardise(features.width)
         learnt = before.fit(features(fitted_on))(features(fitted_on))

@@ -45,13 +45,10 @@ class DynamicsKnowledge:
         factor = twin.factor.copy()
         factor[-len(twin.process) :] = 0.0
         factor = factor[:, factor.any(axis=0)]
-        require(
-            factor.size > 0,
-            "twin",
-            expected="corrected dynamics with uncertain parameters",
-            got="equations that are certain",
-            remedy="fit them with a discrepancy or with parameters that are estimated",
-        )
+        expected = "corrected dynamics with uncertain parameters"
+        got = "equations that are certain"
+        remedy = "fit them with a discrepancy or with parameters that are estimated"
+        require(factor.size > 0, "twin", expected=expected, got=got, remedy=remedy)
         return cls(replace(twin, factor=factor))
 
     def knowledge(self, commands: NDArray, *, max_predictions: int = 2000) -> Knowledge:

@@ -25,19 +25,11 @@ from retwin.update.corrections import CommandSpace, before_sensor
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.residual import ResidualModel, infer_discrepancy
 
-MIN_TRAJECTORIES = 3
-"""Healthy trajectories at least: fewer do not show how much segments scatter."""
-REFERENCES = 64
-"""Trajectories of the sampler at whose segments the twin is to predict."""
-RANDOM = 32
-"""Random continuations with which the chosen one is compared."""
 FURTHER = 60
 """Largest number of further trajectories that is reported as needed."""
 BAND = float(norm.ppf(0.975))
 """Half the width of the band outside of which a segment is faulty, in standard deviations: one
 healthy segment in twenty is outside."""
-PARTS = 4
-"""Parts of the candidates, one after the other: memory."""
 
 
 @dataclass(frozen=True)
@@ -179,18 +171,22 @@ def next_experiments(
     rng = np.random.default_rng(checked_seed(seed))
     healthy = calibration[calibration.maybe_healthy]
     remedy = "record any healthy ones first"
-    least = 1 if isinstance(twin, DynamicsTwin) else MIN_TRAJECTORIES
+    # Healthy trajectories at least: fewer do not show how much segments scatter.
+    least = 1 if isinstance(twin, DynamicsTwin) else 3
     at_least("calibration", healthy, least, "healthy trajectories", remedy=remedy)
-    references = sampler.sample(REFERENCES, rng=rng)
+    # Trajectories of the sampler at whose segments the twin is to predict.
+    references = sampler.sample(64, rng=rng)
     known, curve = _learn(twin, healthy, references, rng)
     show(0.6)
     now = known.knowledge(references)
     drawn = sampler.sample(candidates, rng=rng)
-    roots = _joined([known.roots(part) for part in np.array_split(drawn, PARTS) if len(part)])
+    # Parts of the candidates, one after the other: memory.
+    roots = _joined([known.roots(part) for part in np.array_split(drawn, 4) if len(part)])
     show(0.9)
     picked, after = chosen(now, roots, max(count, min(FURTHER, candidates)))
     every = [now, *after]
-    walks = [_walk(now, roots, rng, len(every) - 1) for _ in range(RANDOM)]
+    # Random continuations with which the chosen one is compared.
+    walks = [_walk(now, roots, rng, len(every) - 1) for _ in range(32)]
     # The scatter too is estimated from few trajectories.
     unsure = _widenings(twin, len(healthy), len(every))
     random = np.array([[each.excess for each in walk] for walk in walks])

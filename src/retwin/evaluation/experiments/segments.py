@@ -21,9 +21,6 @@ from retwin.update.corrections import Context, Correction, Discrepancy, before_s
 from retwin.update.residual import ResidualModel
 from retwin.update.residual.model import describe
 
-STEP = 0.1
-"""Step of finite differences of z, in standard deviations of its scatter."""
-
 
 @dataclass(frozen=True, eq=False)
 class SegmentKnowledge:
@@ -137,8 +134,15 @@ class SegmentKnowledge:
         made = torch.einsum("nmaj,nmf->nmajf", root, rows)
         return made.flatten(3).flatten(1, 2)
 
-    def _information(self, context: Context) -> Tensor:
-        """(n, M, k, k) information about z of each segment in the outputs of its samples."""
+    def _information(self, context: Context, *, step: float = 0.1) -> Tensor:
+        """(n, M, k, k) information about z of each segment in the outputs of its samples.
+
+        Parameters
+        ----------
+        step : float, default 0.1
+            Step of finite differences of z, in standard deviations of its scatter.
+
+        """
         correction: Any = self.twin.residual.correction
         mean = torch.zeros(*context.segments.start.shape, len(self.twin.residual.latent))
         mean[..., self.used] = (self.design(context) @ self.coefficients.mT).float()
@@ -150,9 +154,9 @@ class SegmentKnowledge:
             self.used.tolist(), self.scatter.diagonal().sqrt().tolist(), strict=True
         ):
             moved = mean.clone()
-            moved[..., index] += STEP * deviation
+            moved[..., index] += step * deviation
             change = _apply(correction, context, moved, times) - base
-            slopes.append(change.double() / (STEP * deviation))
+            slopes.append(change.double() / (step * deviation))
         slope = torch.stack(slopes, dim=-1)  # (n, S, d_y, k)
         products = torch.einsum("ntyi,ntyj->ntij", slope, slope)
         start, stop = (

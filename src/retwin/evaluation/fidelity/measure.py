@@ -15,7 +15,7 @@ from retwin.checks import require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import PER_SAMPLE, Channels, Trajectories
 from retwin.evaluation.fidelity.figures import BINS, Fidelity
-from retwin.evaluation.fidelity.latents import shown_latents
+from retwin.evaluation.fidelity.overlay import shown_latents
 from retwin.progress import Progress, tracked
 from retwin.scores.distributions import (
     LEVELS,
@@ -184,13 +184,10 @@ def measure_widening(
 def _check(twin: Twin, trajectories: Trajectories, rate: float | None, draws: int) -> int:
     """The stride of the comparison in samples; InputError for what cannot be compared."""
     stride = checked_stride(twin, trajectories, rate, "trajectories")
-    require(
-        np.all(np.any(np.all(trajectories.mask, axis=2), axis=1)),
-        "trajectories",
-        expected="some sample with all outputs measured in each",
-        got="one that was never measured",
-        remedy="leave it out",
-    )
+    seen = np.all(np.any(np.all(trajectories.mask, axis=2), axis=1))
+    expected = "some sample with all outputs measured in each"
+    got = "one that was never measured"
+    require(seen, "trajectories", expected=expected, got=got, remedy="leave it out")
     whole("draws", draws, at_least=INFERRED, remedy="take the default of 200")
     return stride
 

@@ -1,4 +1,7 @@
-"""Each trajectory beside the predictive distribution of its commands without a fault."""
+"""Each trajectory beside the predictive distribution of its commands without a fault.
+
+How pages show the components of z: delays in ms, though they are in samples inside.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,19 @@ from numpy.typing import NDArray
 
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.evaluation.fidelity.latents import shown_latents
-from retwin.evaluation.fidelity.stored import StoredArrays
+from retwin.evaluation.fidelity.figures import StoredArrays
 from retwin.progress import Progress, tracked
 from retwin.scores.distributions import quantiles
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.residual import infer_discrepancy, segment
 from retwin.update.training_range import checked_once
+
+
+def shown_latents(latent: Channels, rate: float) -> tuple[Channels, NDArray]:
+    """Names and units of z as shown, and the factor (k,) by which each component is multiplied."""
+    samples = np.array([unit == "samples" for unit in latent.units])
+    units = ("ms" if each else unit for each, unit in zip(samples, latent.units, strict=True))
+    return Channels(latent.names, tuple(units)), np.where(samples, 1000 / rate, 1.0)
 
 
 @dataclass(frozen=True, eq=False)

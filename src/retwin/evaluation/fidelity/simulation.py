@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.evaluation.fidelity.stored import StoredArrays
+from retwin.evaluation.fidelity.figures import StoredArrays
 from retwin.progress import Progress, tracked
 from retwin.scores.distributions import central_band, crps, inside, log_score, quantiles
 from retwin.twins.twin import Twin

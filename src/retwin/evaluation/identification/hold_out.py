@@ -42,13 +42,9 @@ def hold_out(
         The share is out of range, or leaves one of the sets without a measurement.
 
     """
-    require(
-        0 <= share < 1,
-        "share",
-        expected="a number from 0 to below 1",
-        got=repr(share),
-        remedy="a quarter is usual; 0 holds out nothing",
-    )
+    expected = "a number from 0 to below 1"
+    remedy = "a quarter is usual; 0 holds out nothing"
+    require(0 <= share < 1, "share", expected=expected, got=repr(share), remedy=remedy)
     if share == 0:
         return measured, None
     count = len(measured)

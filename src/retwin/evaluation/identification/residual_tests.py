@@ -11,9 +11,6 @@ from scipy.special import ndtr
 from retwin.data.trajectories import Trajectories
 from retwin.scores.residuals import autocorrelation, cross_correlation, ljung_box
 
-NORMAL = 1.959964
-"""The 97.5 % quantile of the normal distribution, which the limits of correlations contain."""
-
 
 @dataclass(frozen=True)
 class InputTest:
@@ -98,6 +95,7 @@ def _with_input(residual: NDArray, command: NDArray, name: str, rate: float) -> 
         return InputTest(name, float("nan"), float("nan"), float("nan"))
     found = cross_correlation(residual, command)
     at = found.largest
-    deviations = abs(found.values[at]) / found.limits[at] * NORMAL
+    # The 97.5 % quantile of the normal distribution, which the limits of correlations contain.
+    deviations = abs(found.values[at]) / found.limits[at] * 1.959964
     p_value = min(1.0, 2 * float(ndtr(-deviations)) * len(found.lags))
     return InputTest(name, float(found.values[at]), float(found.lags[at]) / rate, p_value)

@@ -208,21 +208,15 @@ def validate_identification(
         The twin cannot simulate some of the held-out commands.
 
     """
-    require(
-        isinstance(found, Updated | Posterior),
-        "found",
-        expected="an Updated or a Posterior",
-        got=type(found).__name__,
-        remedy="give what rt.identify returned",
-    )
+    identified = isinstance(found, Updated | Posterior)
+    expected = "an Updated or a Posterior"
+    remedy = "give what rt.identify returned"
+    require(identified, "found", expected=expected, got=type(found).__name__, remedy=remedy)
     mean = found.twin.twin if isinstance(found, Posterior) else found.twin
-    require(
-        mean.names == before.names,
-        "before",
-        expected=f"the twin with the parameters {', '.join(mean.names)}",
-        got=", ".join(before.names),
-        remedy="give the twin that was identified, at its values before",
-    )
+    expected = f"the twin with the parameters {', '.join(mean.names)}"
+    got = ", ".join(before.names)
+    remedy = "give the twin that was identified, at its values before"
+    require(mean.names == before.names, "before", expected=expected, got=got, remedy=remedy)
     horizon = found.horizon if isinstance(found, Updated) else float("inf")
     parts: dict[Part, Trajectories] = {"identification": used}
     if held_out is not None:

@@ -28,8 +28,6 @@ PER_UNIT = 64
 LEVELS = np.linspace(-3.0, 3.0, 13)
 """Values to which the score before is rounded, on which bets on dependence and repetition depend:
 halves, which are as narrow as a repetition. Beyond them, dependence would be as good as a shift."""
-FLOOR = 1e-6
-"""Least value of a bet before its division: a product never becomes 0."""
 EDGES = np.concatenate(
     [[-np.inf], np.arange(-CLIP * PER_UNIT, CLIP * PER_UNIT + 1) / PER_UNIT, [np.inf]]
 )
@@ -192,10 +190,17 @@ class Bets:
         return (which * len(LEVELS) + np.rint(steps).astype(np.intp)) * len(EDGES)
 
 
-def _bets(alternative: Alternative, slack: Slack) -> NDArray:
-    """An alternative's bet (levels, cells), divided by its largest expectation over the class."""
+def _bets(alternative: Alternative, slack: Slack, *, floor: float = 1e-6) -> NDArray:
+    """An alternative's bet (levels, cells), divided by its largest expectation over the class.
+
+    Parameters
+    ----------
+    floor : float, default 1e-6
+        Least value of a bet before its division: a product never becomes 0.
+
+    """
     logs = [alternative.log_bet(CENTRES, level, slack.kappa) for level in LEVELS]
-    values = np.maximum(np.exp(np.minimum(logs, 40.0)), FLOOR)
+    values = np.maximum(np.exp(np.minimum(logs, 40.0)), floor)
     # Scores that a member of the class may have at the Gaussian quantiles of each cell.
     first = np.searchsorted(EDGES, slack.lower(EDGES[:-1]), side="right") - 1
     last = np.searchsorted(EDGES, slack.upper(EDGES[1:]), side="left")

@@ -104,12 +104,10 @@ class Detector:
     def start(self, streams: int) -> DetectorState:
         """The state before the first sample, and after a reset."""
         count = whole("streams", streams, at_least=1)
+        expected = f"{len(self.which)}, as many as there are slacks"
+        remedy = "give one slack for all streams, or one for each"
         require(
-            len(self.which) in (1, count),
-            "streams",
-            expected=f"{len(self.which)}, as many as there are slacks",
-            got=count,
-            remedy="give one slack for all streams, or one for each",
+            len(self.which) in (1, count), "streams", expected=expected, got=count, remedy=remedy
         )
         return DetectorState(np.zeros((count, len(self.bets.weights))), np.zeros(count))
 
@@ -208,20 +206,15 @@ class Detector:
         """Lower and upper ends (streams, T) of scores, which are checked."""
         low = np.asarray(score, dtype=float)
         top = low if high is None else np.asarray(high, dtype=float)
-        require(
-            low.ndim == 2 and low.shape == top.shape and len(low) == len(previous),
-            "score",
-            expected=f"scores of {len(previous)} streams, upper ends of the same shape",
-            got=f"shapes {low.shape} and {top.shape}",
-            remedy="start a state for as many streams as there are",
-        )
-        require(
-            not np.any(low > top),
-            "score",
-            expected="lower ends of intervals that are not above the upper ones",
-            got="at least one that is",
-            remedy="give what `ConformalScores.score` returns, in its order",
-        )
+        fits = low.ndim == 2 and low.shape == top.shape and len(low) == len(previous)
+        expected = f"scores of {len(previous)} streams, upper ends of the same shape"
+        got = f"shapes {low.shape} and {top.shape}"
+        remedy = "start a state for as many streams as there are"
+        require(fits, "score", expected=expected, got=got, remedy=remedy)
+        expected = "lower ends of intervals that are not above the upper ones"
+        got = "at least one that is"
+        remedy = "give what `ConformalScores.score` returns, in its order"
+        require(not np.any(low > top), "score", expected=expected, got=got, remedy=remedy)
         return low, top
 
     def factors(

@@ -11,10 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import require, whole
 
-GLITCH = 100.0
-"""An error of so many standard deviations is scored, but the filter takes the sample as missing: a
-sample of 1e300 would else stay in its state. Where such samples persist, its uncertainty grows
-until it follows them."""
 LARGEST_PARTIAL = 0.9995
 """Of the partial autocorrelations: an average of two thousand samples."""
 GRID = [(a, b) for a in (-0.5, 0.2, 0.8, 1.4, 2.0, 2.6, 3.2) for b in (-8.0, -3.0, -1.0, 1.0, 3.0)]
@@ -106,13 +102,10 @@ class Disturbance:
 
         """
         given = np.asarray(residual, dtype=float)
-        require(
-            given.ndim == 2 and len(given) == len(self.mean),
-            "residual",
-            expected=f"residuals of {len(self.mean)} streams",
-            got=f"shape {given.shape}",
-            remedy="give one row per stream of the calibration",
-        )
+        fits = given.ndim == 2 and len(given) == len(self.mean)
+        expected = f"residuals of {len(self.mean)} streams"
+        remedy = "give one row per stream of the calibration"
+        require(fits, "residual", expected=expected, got=f"shape {given.shape}", remedy=remedy)
         mean = state.mean.T.copy()
         covariance = np.moveaxis(state.covariance, 0, -1).copy()
         errors, deviation = np.empty((2, *given.shape[::-1]))
@@ -159,24 +152,17 @@ def fit_disturbance(
         remedy="calibrate on a longer healthy record",
     )
     mean, scale = np.nanmean(given, axis=1), np.nanstd(given, axis=1)
-    require(
-        np.all(scale > 1e-12 * np.abs(mean)),
-        "residual",
-        expected="residuals that vary in each stream",
-        got=f"a constant in stream {np.argmin(scale)}",
-        remedy="leave out a channel that does not move",
-    )
+    vary = np.all(scale > 1e-12 * np.abs(mean))
+    got = f"a constant in stream {np.argmin(scale)}"
+    remedy = "leave out a channel that does not move"
+    require(vary, "residual", expected="residuals that vary in each stream", got=got, remedy=remedy)
     if isinstance(folds, int):
         folds = np.array_split(np.arange(given.shape[1]), whole("folds", folds, at_least=2))
     fewest = min((seen.sum(axis=1) - seen[:, each].sum(axis=1)).min() for each in folds)
     enough = MIN_RESIDUALS // 2
-    require(
-        fewest >= enough,
-        "residual",
-        expected=f"at least {enough} residuals outside each of {len(folds)} parts of the record",
-        got=str(fewest),
-        remedy="leave out the parts of the record in which nothing was measured",
-    )
+    expected = f"at least {enough} residuals outside each of {len(folds)} parts of the record"
+    remedy = "leave out the parts of the record in which nothing was measured"
+    require(fewest >= enough, "residual", expected=expected, got=str(fewest), remedy=remedy)
     values = ((given - mean[:, None]) / scale[:, None]).T
     blocks = _blocks(values)
     point = _orders(blocks, max_order)
@@ -199,18 +185,26 @@ Model = tuple[NDArray, NDArray | float, NDArray]
 
 
 def _errors(
-    values: NDArray, model: Model, mean: NDArray, covariance: NDArray
+    values: NDArray, model: Model, mean: NDArray, covariance: NDArray, *, glitch: float = 100.0
 ) -> Iterator[tuple[NDArray, NDArray]]:
     """Errors and their variances (..., streams), sample by sample; mean and covariance change.
 
     Shapes: values (T, streams), covariance (p, p, ..., streams).
+
+    Parameters
+    ----------
+    glitch : float, default 100.0
+        An error of so many standard deviations is scored, but the filter takes the sample as
+        missing: a sample of 1e300 would else stay in its state. Where such samples persist, its
+        uncertainty grows until it follows them.
+
     """
     coefficients, process, measurement = model
     order = len(coefficients)
     for value in values:
         error = value - mean[0]
         variance = covariance[0, 0] + measurement
-        used = np.abs(error) <= GLITCH * np.sqrt(variance)  # False for NaN
+        used = np.abs(error) <= glitch * np.sqrt(variance)  # False for NaN
         yield error, variance
         gain = np.where(used, covariance[0] / variance, 0.0)
         first = covariance[0].copy()

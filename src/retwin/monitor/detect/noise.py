@@ -18,18 +18,10 @@ from scipy.special import expit
 DECAYS = np.array([0.5, 0.9, 0.98])
 """Factors per sample by which a change of a command is forgotten: within two, ten and fifty
 samples. A sum of them describes what lasts for any time between."""
-NARROWEST = 1e-3
-"""Width of the interval of an error that is not rounded, in its standard deviations."""
-PENALTY = 4.0
-"""Of squared weights, in nats: a weight is 0 but for a few samples' evidence of another one."""
 LARGEST = 4.0
 """Errors count up to this for the scale of a record, so that no fault is taken for it."""
-FEWEST = 8
-"""Errors of a record of which the variance is counted."""
 DEGREES = (4.0, 1e4)
 """Limits of the degrees of freedom of a record's variance."""
-FARTHEST = 8.0
-"""Errors count up to this, so that single outliers do not decide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +83,19 @@ def own_scale(sums: NDArray, errors: NDArray, degrees: NDArray) -> tuple[NDArray
     return np.sqrt(total / count), sums[:, :, -1]
 
 
-def fit_degrees(errors: NDArray, folds: Sequence[NDArray]) -> NDArray:
-    """Degrees of freedom (S,) of the variance of records, from errors (S, T) that were left out."""
+def fit_degrees(errors: NDArray, folds: Sequence[NDArray], *, fewest: int = 8) -> NDArray:
+    """Degrees of freedom (S,) of the variance of records, from errors (S, T) that were left out.
+
+    Parameters
+    ----------
+    fewest : int, default 8
+        Errors of a record of which the variance is counted.
+
+    """
     squares = np.minimum(np.abs(np.nan_to_num(errors)), LARGEST) ** 2
     pairs = ((squares[:, fold], np.isfinite(errors[:, fold])) for fold in folds)
     sums = np.array([(both[0].sum(axis=1), both[1].sum(axis=1)) for both in pairs])
-    enough = sums[:, 1] >= FEWEST
+    enough = sums[:, 1] >= fewest
     logs = np.where(enough, np.log(np.maximum(sums[:, 0], 1e-9) / np.maximum(sums[:, 1], 1)), 0.0)
     spread = (logs**2).sum(axis=0) / np.maximum(enough.sum(axis=0) - 1, 1)
     made: NDArray = np.clip(2 / np.maximum(spread, 1e-9), *DEGREES)
@@ -134,6 +133,9 @@ def fit_noise(
     given: NDArray,
     sizes: tuple[int, ...],
     folds: Sequence[NDArray],
+    *,
+    narrowest: float = 1e-3,
+    farthest: float = 8.0,
 ) -> tuple[Noise, NDArray, NDArray]:
     """The noise of errors (S, T), with means and scales (S, T) of folds that were left out.
 
@@ -147,6 +149,10 @@ def fit_noise(
         Numbers of features of each kind: commands, changes, levels.
     folds : sequence of NDArray
         Samples that are left out in turn.
+    narrowest : float, default 1e-3
+        Width of the interval of an error that is not rounded, in its standard deviations.
+    farthest : float, default 8.0
+        Errors count up to this, so that single outliers do not decide.
 
     """
     seen = np.isfinite(errors).any(axis=0)
@@ -160,7 +166,7 @@ def fit_noise(
     apart = np.zeros((2, *errors.shape))
     for i, (error, wide) in enumerate(zip(errors, width, strict=True)):
         own = np.flatnonzero(np.isfinite(error))
-        ends = np.clip(error, -FARTHEST, FARTHEST), np.maximum(np.nan_to_num(wide), NARROWEST)
+        ends = np.clip(error, -farthest, farthest), np.maximum(np.nan_to_num(wide), narrowest)
         best = -np.inf
         for chosen in candidates:
             used = np.append(chosen, True)
@@ -187,8 +193,15 @@ def _density(mean: NDArray, logs: NDArray, error: NDArray, width: NDArray) -> ND
     return made - np.log(width)
 
 
-def _fitted(design: NDArray, error: NDArray, width: NDArray) -> NDArray:
-    """Weights (2, F) of mean and logarithm of the scale that maximise the penalised likelihood."""
+def _fitted(design: NDArray, error: NDArray, width: NDArray, *, penalty: float = 4.0) -> NDArray:
+    """Weights (2, F) of mean and logarithm of the scale that maximise the penalised likelihood.
+
+    Parameters
+    ----------
+    penalty : float, default 4.0
+        Of squared weights, in nats: a weight is 0 but for a few samples' evidence of another one.
+
+    """
     size = design.shape[1]
 
     def loss(point: NDArray) -> tuple[float, NDArray]:
@@ -202,7 +215,7 @@ def _fitted(design: NDArray, error: NDArray, width: NDArray) -> NDArray:
         slopes = np.stack([low * (1 - low), high * (1 - high)])
         by_mean = (slopes[1] - slopes[0]) / mass / scale * np.where(upper, -1, 1)
         by_scale = (slopes[1] * ends[1] - slopes[0] * ends[0]) / mass
-        ridge = PENALTY * np.where(np.arange(2 * size) % size == size - 1, 0.0, 1.0)
+        ridge = penalty * np.where(np.arange(2 * size) % size == size - 1, 0.0, 1.0)
         value = -np.log(mass).sum() + (ridge * point**2).sum() / 2
         slope = np.concatenate([by_mean @ design, by_scale @ design])
         return float(value), slope + ridge * point

@@ -30,13 +30,9 @@ MAX_LOG_RATIO = np.log(5.0)
 be an outlier, of which the calibration has too few to know how often they come."""
 FARTHEST = 1e6
 """Standard deviations up to which offsets are distinguished, so that squares stay finite."""
-SMALLEST = 0.1
-"""Smallest size that is tried, in standard deviations: of less there is no evidence."""
 DEGREES = (2.5, 100.0)
 """Degrees of freedom of Student's distribution that are tried: below 2 it has no variance, and
 above 100 it is a normal one."""
-TRIED = 60
-"""Degrees of freedom that are tried between these."""
 WORSE = CERTAIN**2 / 2
 """Nats by which degrees of freedom may be less likely than the best: 95 % in each direction."""
 
@@ -97,7 +93,8 @@ class OffsetModel:
         error = (np.nan_to_num(offsets, nan=self.mean[own]) - self.mean[own]) / scale
         error = np.clip(error, -FARTHEST, FARTHEST)
         healthy = np.max([_log_density(error, each) for each in self.degrees], axis=0)
-        low, high = (max(each / scale, SMALLEST) for each in fault.size)
+        # Smallest size that is tried, in standard deviations: of less there is no evidence.
+        low, high = (max(each / scale, 0.1) for each in fault.size)
         made = []
         for share in SIZES:
             size = low ** (1 - share) * high**share
@@ -162,9 +159,16 @@ def _moments(sums: NDArray) -> tuple[NDArray, NDArray]:
     return mean, np.sqrt(np.maximum(sums[2] / count - mean**2, 0.0))
 
 
-def _degrees(errors: NDArray) -> NDArray:
-    """The fewest, the most likely and the most degrees of freedom (3,) of standardised errors."""
-    tried = np.geomspace(*DEGREES, TRIED)
+def _degrees(errors: NDArray, *, degrees_tried: int = 60) -> NDArray:
+    """The fewest, the most likely and the most degrees of freedom (3,) of standardised errors.
+
+    Parameters
+    ----------
+    degrees_tried : int, default 60
+        Degrees of freedom that are tried between these.
+
+    """
+    tried = np.geomspace(*DEGREES, degrees_tried)
     if not len(errors):
         return tried[[0, -1, -1]]
     likelihood = np.array([_log_density(errors, each).sum() for each in tried])

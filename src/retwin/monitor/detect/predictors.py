@@ -31,13 +31,8 @@ IMPLAUSIBLE = 100.0
 """Ranges of a command in calibration by which it may leave that range. What is farther away stands
 for a missing one, such as 1e9 or 3.4e38; a filter that took it for real would predict nothing until
 the states have decayed from there."""
-SETTLED = 1.05
-"""Ratio of predicted standard deviations, for starts of which one is twice as uncertain, up to
-which the filter knows the states of a machine that it did not see start."""
 WIDER = 1.25 ** np.arange(1, 17)
 """Factors of the slack of which the first is taken with which the calibration agrees."""
-WINDOWS = 16
-"""Windows of successive samples that the calibration contains at least, for their mean product."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +111,9 @@ def settled(online: OnlineFilter, count: int, given: tuple[NDArray, ...]) -> int
     )
     ratio = own / other
     # Where nothing is measured, as after the end of a shorter record, nothing is known better.
-    differs = ((np.abs(np.log(ratio)) > 2 * np.log(SETTLED)) & given[2]).any(axis=(0, 2))
+    # Ratio of predicted standard deviations, for starts of which one is twice as uncertain, up to
+    # which the filter knows the states of a machine that it did not see start.
+    differs = ((np.abs(np.log(ratio)) > 2 * np.log(1.05)) & given[2]).any(axis=(0, 2))
     differs = differs[: own.shape[1] // 2]
     return int(np.flatnonzero(differs)[-1]) + 1 if differs.any() else 0
 
@@ -163,10 +160,17 @@ def agreeing(
     return tuple(made)
 
 
-def _bets_win(detector: Detector, parts: Sequence[Scored]) -> NDArray:
+def _bets_win(detector: Detector, parts: Sequence[Scored], *, windows: int = 16) -> NDArray:
     """Streams with an alternative whose bets over successive samples have a mean product above 1.
 
-    All lengths that the parts contain `WINDOWS` times are tried, in powers of two.
+    All lengths that the parts contain `windows` times are tried, in powers of two.
+
+    Parameters
+    ----------
+    windows : int, default 16
+        Windows of successive samples that the calibration contains at least, for their mean
+        product.
+
     """
     first = np.zeros(len(detector.which))
     logs = []
@@ -174,7 +178,7 @@ def _bets_win(detector: Detector, parts: Sequence[Scored]) -> NDArray:
         factors = detector.factors(first, *detector.intervals(first, low, high))
         logs.append(np.cumsum(np.log([factor for factor, _, _ in factors]), axis=0))
     made = np.zeros(len(first), dtype=bool)
-    length, longest = 1, sum(len(each) for each in logs) // WINDOWS
+    length, longest = 1, sum(len(each) for each in logs) // windows
     while length <= longest:
         products = [np.exp(each[length:] - each[:-length]) for each in logs]
         made |= (np.concatenate(products).mean(axis=0) > 1 + 1e-9).any(axis=0)

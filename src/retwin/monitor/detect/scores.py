@@ -18,12 +18,6 @@ MIN_ERRORS = 8
 """Calibration errors per stream, at least."""
 COPIES = 8
 """Places inside a rounding interval that stand for a rounded error."""
-REPEATED = 0.02
-"""Share of samples that repeat the one before from which on a sensor may round."""
-NEAR = 10.0
-"""Steps up to which a difference is counted with a step that is not exact yet."""
-INEXACT = 0.05
-"""Share of a step by which a value may be no multiple of it."""
 SCALES = np.geomspace(0.05, 2, 32)
 """Standard deviations of errors before rounding, relative to those after it."""
 
@@ -74,13 +68,10 @@ class ConformalScores:
 
         """
         given = np.asarray(errors, dtype=float)
-        require(
-            given.ndim and len(given) == len(self.independent),
-            "errors",
-            expected=f"errors of {len(self.independent)} streams",
-            got=f"shape {given.shape}",
-            remedy="give one row per stream of the calibration",
-        )
+        fits = given.ndim and len(given) == len(self.independent)
+        expected = f"errors of {len(self.independent)} streams"
+        remedy = "give one row per stream of the calibration"
+        require(fits, "errors", expected=expected, got=f"shape {given.shape}", remedy=remedy)
         streams = np.arange(len(given)).reshape(-1, *(1,) * (given.ndim - 1))
         half = np.asarray(width, dtype=float) / 2 if self.copies > 1 else 0.0
         missing = np.isnan(given + half)
@@ -142,13 +133,11 @@ def fit_scores(errors: ArrayLike, width: ArrayLike = 0.0) -> ConformalScores:
     given = np.asarray(errors, dtype=float)
     widths = np.broadcast_to(np.asarray(width, dtype=float), given.shape)
     seen = np.isfinite(given) & np.isfinite(widths)
-    require(
-        given.ndim == 2 and given.size and seen.sum(axis=-1).min() >= MIN_ERRORS,
-        "errors",
-        expected=f"an array (streams, T) with at least {MIN_ERRORS} finite errors per stream",
-        got=f"shape {given.shape}" + (f" with {seen.sum(axis=-1).min()}" if given.size else ""),
-        remedy="calibrate on a longer healthy record",
-    )
+    enough = given.ndim == 2 and given.size and seen.sum(axis=-1).min() >= MIN_ERRORS
+    expected = f"an array (streams, T) with at least {MIN_ERRORS} finite errors per stream"
+    got = f"shape {given.shape}" + (f" with {seen.sum(axis=-1).min()}" if given.size else "")
+    remedy = "calibrate on a longer healthy record"
+    require(enough, "errors", expected=expected, got=got, remedy=remedy)
     rounded = bool(np.any(widths[seen] > 0))
     copies = COPIES if rounded else 1
     rows = [
@@ -189,23 +178,33 @@ def resolution(measured: ArrayLike) -> NDArray:
     return np.array([_step_of(row[np.isfinite(row)]) for row in given])
 
 
-def _step_of(seen: NDArray) -> float:
-    """The step of finite values (n,), 0 for none."""
+def _step_of(seen: NDArray, *, inexact: float = 0.05, repeated_share: float = 0.02) -> float:
+    """The step of finite values (n,), 0 for none.
+
+    Parameters
+    ----------
+    inexact : float, default 0.05
+        Share of a step by which a value may be no multiple of it.
+    repeated_share : float, default 0.02
+        Share of samples that repeat the one before from which on a sensor may round.
+
+    """
     values = np.unique(seen)
     if len(values) >= len(seen) / 2:
         repeated = seen[1:][np.diff(seen) == 0]
-        values = np.unique(repeated) if len(repeated) > REPEATED * len(seen) else values[:0]
+        values = np.unique(repeated) if len(repeated) > repeated_share * len(seen) else values[:0]
     if len(values) < 2:
         return 0.0
     offsets, gaps = values - values[0], np.diff(values)
     for step in np.unique(gaps)[::-1]:
         # Small gaps first, since the error of a step adds up over many.
-        near = gaps < NEAR * step
+        # Steps up to which a difference is counted with a step that is not exact yet.
+        near = gaps < 10.0 * step
         many = np.round(gaps[near] / step)
         better = float(many @ gaps[near] / (many @ many))
         number = np.concatenate([[0], np.cumsum(np.round(gaps / better))])
         exact = float(number @ offsets / (number @ number))
-        if np.all(np.abs(offsets - exact * number) <= INEXACT * exact):
+        if np.all(np.abs(offsets - exact * number) <= inexact * exact):
             return exact
     return 0.0
 

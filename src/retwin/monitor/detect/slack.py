@@ -98,14 +98,11 @@ class Slack:
             Rounded up to multiples of 0.01.
 
         """
-        require(
-            8 <= samples < np.inf,
-            "samples",
-            expected="an effective number of at least 8 independent errors of prediction",
-            got=f"{samples:.3g}",
-            remedy="calibrate on longer healthy records; where errors persist for most of a long "
-            "one, the twin does not follow that machine: fit it to the machine first",
-        )
+        expected = "an effective number of at least 8 independent errors of prediction"
+        got = f"{samples:.3g}"
+        remedy = "calibrate on longer healthy records; where errors persist for most of a long "
+        remedy += "one, the twin does not follow that machine: fit it to the machine first"
+        require(8 <= samples < np.inf, "samples", expected=expected, got=got, remedy=remedy)
         count = float(samples)
         finite("confidence", confidence, at_least=0.5, at_most=0.9999)
         variance = (np.pi / 2 + whole("parameters", parameters)) / count
@@ -143,13 +140,10 @@ def effective_samples(scores: NDArray) -> NDArray:
     Geyer, Practical Markov chain Monte Carlo, Statistical Science 7 (1992), initial sequences.
 
     """
-    require(
-        np.ndim(scores) == 2,
-        "scores",
-        expected="an array (streams, T)",
-        got=f"shape {np.shape(scores)}",
-        remedy="give one row per stream",
-    )
+    expected = "an array (streams, T)"
+    got = f"shape {np.shape(scores)}"
+    remedy = "give one row per stream"
+    require(np.ndim(scores) == 2, "scores", expected=expected, got=got, remedy=remedy)
     ranks = np.where(np.isfinite(scores), np.clip(scores, -3, 3), np.nan)
     found = [_independent(each) for each in (ranks, np.abs(ranks))]
     return np.minimum(*found)

@@ -10,11 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.checks import finite, instance, positive, whole
 from retwin.monitor.detect.detector import LARGEST, Detector
 
-MAX_PER_BLOCK = 3.0
-"""Evidence of a block of samples counts up to this, so that no short fault voids the promise."""
-MAX_PER_ALARM = 4.0
-"""The same for a run length: four very short ones in a row void the promise at α = 0.01."""
-
 
 @dataclass(frozen=True)
 class ValidityState:
@@ -172,18 +167,19 @@ class Validity:
     def _with_alarms(self, state: ValidityState, alarm: NDArray) -> ValidityState:
         """After alarms in some streams: their run lengths are evidence."""
         value = np.sqrt(self.arl / np.maximum(state.length, 1)) / 2
-        runs = np.minimum(state.runs * np.minimum(value, MAX_PER_ALARM), LARGEST)
+        # So much evidence of one run at most: four very short ones void the promise at α = 0.01.
+        runs = np.minimum(state.runs * np.minimum(value, 4.0), LARGEST)
         return replace(
-            state,
-            runs=np.where(alarm, runs, state.runs),
-            length=np.where(alarm, 0.0, state.length),
+            state, runs=np.where(alarm, runs, state.runs), length=np.where(alarm, 0.0, state.length)
         )
 
     def _with_blocks(self, state: ValidityState, full: NDArray) -> ValidityState:
         """After the last sample of a block in some streams."""
         weighted = (state.products * self.detector.bets.weights).T
         value = np.add.accumulate(weighted, axis=0)[-1]
-        most = np.where(state.alarmed > 0, 1.0, MAX_PER_BLOCK)
+        # Evidence of a block of samples counts up to this, so that no short fault voids the
+        # promise.
+        most = np.where(state.alarmed > 0, 1.0, 3.0)
         factor = (1 + np.minimum(value, most)) / 2
         weight = 1 / ((state.blocks + 1) * (state.blocks + 2))
         quiet = np.minimum((state.quiet + weight) * factor, LARGEST)

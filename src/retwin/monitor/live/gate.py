@@ -13,8 +13,6 @@ from retwin.monitor.live.live import Live
 from retwin.monitor.live.machine import Received
 from retwin.monitor.store.samples import Samples, Trajectory
 
-QUEUE = 10_000
-"""Producers that may wait at the same time; further ones wait before they are taken."""
 GROUP = 50_000
 """Samples of one commit at most, beside those of one producer."""
 
@@ -37,7 +35,8 @@ class Gate:
 
     def __init__(self, live: Live) -> None:
         self.live = live
-        self._queues: list[queue.Queue[_Waiting | None]] = [queue.Queue(QUEUE) for _ in range(2)]
+        # Producers that may wait at the same time; further ones wait before they are taken.
+        self._queues: list[queue.Queue[_Waiting | None]] = [queue.Queue(10_000) for _ in range(2)]
         self._lock = threading.Lock()
         self._closed = False
         self._threads = [

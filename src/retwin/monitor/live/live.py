@@ -27,8 +27,6 @@ from retwin.monitor.store.samples import LATEST, SECOND, Asset, Samples, Traject
 from retwin.monitor.store.store import Store
 from retwin.monitor.versions.registry import Registry
 
-MAX_WAIT = 60.0
-"""Seconds for which a place without a sample is waited for at most."""
 WHY = {
     "late": "it begins before the newest one ends",
     "unknown": "a command of its first sample is missing",
@@ -72,7 +70,8 @@ class Live:
     ) -> None:
         self.store = instance("store", store, Store, remedy="open one with Store(folder)")
         if wait is not None:
-            finite("wait", wait, at_least=0.0, at_most=MAX_WAIT, unit="s")
+            # Seconds for which a place without a sample is waited for at most.
+            finite("wait", wait, at_least=0.0, at_most=60.0, unit="s")
         self._wait = wait
         self._ahead = finite("ahead", ahead, at_least=0.0, at_most=LATEST / SECOND, unit="s")
         self._clock = clock
@@ -178,13 +177,11 @@ class Live:
         """
         for each in batch:
             width = self._one(each.asset).asset.channels
-            require(
-                each.values.ndim == 2 and each.values.shape[1] == width,
-                f"samples of {each.asset}",
-                expected=f"{width} channels",
-                got=each.values.shape[-1],
-                remedy="give commands and then outputs, see Live.channels",
-            )
+            fits = each.values.ndim == 2 and each.values.shape[1] == width
+            expected = f"{width} channels"
+            got = each.values.shape[-1]
+            remedy = "give commands and then outputs, see Live.channels"
+            require(fits, f"samples of {each.asset}", expected=expected, got=got, remedy=remedy)
         found: list[Received] = []
         for whole_, group in groupby(batch, lambda each: self.in_trajectories(each.asset)):
             if whole_:

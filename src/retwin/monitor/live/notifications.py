@@ -77,13 +77,10 @@ class AppriseChannel:
         with warnings.catch_warnings():  # of a module of Python that its services still import
             warnings.simplefilter("ignore", DeprecationWarning)
             known = self._service.add(url)
-        require(
-            known,
-            "notify",
-            expected="an address as Apprise writes it, such as mailto://… or json://host/path",
-            got="another one, which is not shown since it may hold a password",
-            remedy="see https://github.com/caronc/apprise/wiki",
-        )
+        expected = "an address as Apprise writes it, such as mailto://… or json://host/path"
+        got = "another one, which is not shown since it may hold a password"
+        remedy = "see https://github.com/caronc/apprise/wiki"
+        require(known, "notify", expected=expected, got=got, remedy=remedy)
 
     def send(self, text: str, entry: Entry) -> None:
         """Send it; OSError if the service did not take it."""

@@ -21,8 +21,6 @@ from retwin.monitor.store.samples import EARLIEST, SECOND, Asset, Samples, Updat
 
 ALARM = ("sample", "output", "change", "evidence", "machine")
 """What the log has of an alarm, beside its time and that of its event."""
-DEFAULT_WAIT = 2
-"""Sample periods for which a place is waited for, unless it is given."""
 LONGEST_GAP = 10_000
 LONGEST_GAP_SECONDS = 3600.0
 """A pause of more places, or of a longer time, begins a new stream: what was known is too old."""
@@ -71,7 +69,8 @@ class StreamMachine(Machine[Monitor]):
         self.layout = layout
         self.changed = False
         self._period = SECOND / rate
-        self._wait = DEFAULT_WAIT if wait is None else int(np.ceil(wait * rate))
+        # Sample periods for which a place is waited for, unless it is given.
+        self._wait = 2 if wait is None else int(np.ceil(wait * rate))
         self._gap = min(LONGEST_GAP, max(2, round(LONGEST_GAP_SECONDS * rate)))
         self._commands = len(monitor.twin.inputs)
         self._missing = np.full(asset.channels, np.nan)

@@ -24,8 +24,6 @@ from retwin.monitor.store.samples import Asset, Samples, Trajectory, Update
 UNUSUAL = ("unmeasured", "unranked", "implausible")
 """What trajectories may be that is an event of the log when it begins and when it ends. Commands
 outside their range are a status of the machine."""
-REMEMBERED = 1000
-"""Newest trajectories of which the store knows where they begin, for comparisons of versions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +102,16 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         except Exception as error:  # Whatever fails, the next trajectory is diagnosed.
             return str(error) if isinstance(error, InputError) else f"not diagnosed: {brief(error)}"
 
-    def take(self, found: Diagnosed) -> int:
-        """Continue after a diagnosed trajectory; the number of its alarms."""
+    def take(self, found: Diagnosed, *, remembered: int = 1000) -> int:
+        """Continue after a diagnosed trajectory; the number of its alarms.
+
+        Parameters
+        ----------
+        remembered : int, default 1000
+            Newest trajectories of which the store knows where they begin, for comparisons of
+            versions.
+
+        """
         watched, samples = found.watched, found.samples
         last = int(samples.times[-1])
         for alarm in watched.alarms:  # with its cause, which is known at once
@@ -131,7 +137,7 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         self.evidence = float(watched.evidence[-1])
         self.void, self.outside = bool(watched.void[-1]), bool(watched.outside[-1])
         new = np.array([[*samples.times[[0, -1]], len(samples.times)]], dtype=np.int64)
-        self._known = np.concatenate([self._known, new])[-REMEMBERED:]
+        self._known = np.concatenate([self._known, new])[-remembered:]
         self._recent.append((last, float(watched.score[-1]), self.evidence))
         if watched.alarms:
             self.alarms += len(watched.alarms)

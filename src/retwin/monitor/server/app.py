@@ -30,10 +30,6 @@ from retwin.monitor.versions.comparison import Comparisons
 from retwin.monitor.versions.registry import Registry
 from retwin.report.figures.style import CHROME, PALETTE
 
-MIN_TOKEN_LENGTH = 16
-"""Characters of a token at least."""
-LISTENERS = 100
-"""Pages that may listen to events at the same time."""
 PAUSE, HEARTBEAT = 0.25, 15.0
 """Seconds between two events at least, and at most."""
 TEXT = "charset=utf-8"
@@ -61,15 +57,19 @@ class Step(BaseModel):
     reason: str = Field("", max_length=2000)
 
 
-def check_token(token: str | None) -> str:
-    """The token, if it is long enough; another one is an `InputError`."""
-    if not isinstance(token, str) or len(token) < MIN_TOKEN_LENGTH or not token.isascii():
-        raise InputError(
-            "token",
-            expected=f"at least {MIN_TOKEN_LENGTH} ASCII characters",
-            got="another one",
-            remedy="make one: python -c 'import secrets; print(secrets.token_urlsafe())'",
-        )
+def check_token(token: str | None, *, min_token_length: int = 16) -> str:
+    """The token, if it is long enough; another one is an `InputError`.
+
+    Parameters
+    ----------
+    min_token_length : int, default 16
+        Characters of a token at least.
+
+    """
+    if not isinstance(token, str) or len(token) < min_token_length or not token.isascii():
+        expected = f"at least {min_token_length} ASCII characters"
+        remedy = "make one: python -c 'import secrets; print(secrets.token_urlsafe())'"
+        raise InputError("token", expected=expected, got="another one", remedy=remedy)
     return token
 
 
@@ -184,7 +184,8 @@ def _add_reading(app: fastapi.FastAPI, live: Live, views: Views, metrics: Metric
     async def events(request: fastapi.Request) -> Any:
         """Server-sent events: one with the revision whenever something has changed."""
         remedy = "close pages that are not needed"
-        at_most("events", len(listeners) + 1, LISTENERS, "listeners", remedy=remedy)
+        # Pages that may listen to events at the same time.
+        at_most("events", len(listeners) + 1, 100, "listeners", remedy=remedy)
         return fastapi.responses.StreamingResponse(
             _revisions(live, listeners, request.app.state.closing), media_type="text/event-stream"
         )

@@ -15,8 +15,6 @@ from retwin.monitor.store.store import Store
 
 KEPT = 10_000
 """Newest alarms that are kept; all of them are in the log."""
-EVENTS = 50
-"""Newest events of each asset that are kept."""
 
 
 class Journal:
@@ -121,7 +119,8 @@ class Journal:
                 self._alarms[entry.sequence] = made
             if entry.kind == "void":
                 self._void[data["asset"]] = made["time"]
-            self._events.setdefault(data["asset"], deque(maxlen=EVENTS)).append(made)
+            # Newest events of each asset that are kept.
+            self._events.setdefault(data["asset"], deque(maxlen=50)).append(made)
 
 
 def _refines(data: Mapping[str, Any], alarm: Mapping[str, Any]) -> bool:

@@ -20,8 +20,6 @@ else:
     uvicorn = needs_extra("uvicorn", "monitor", "serves the monitor's page")
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
-PATIENCE = 3
-"""Seconds for which requests are finished at the end."""
 HEADERS = 10.0
 """Seconds within which the headers of a request have to end, or its connection is closed: each one
 counts towards those that are served at the same time, and no token was asked for yet."""
@@ -75,19 +73,23 @@ def listening(host: str, port: int) -> socket.socket:
         bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return bound
     except (OSError, OverflowError, UnicodeError) as error:
-        raise InputError(
-            "port",
-            expected=f"one of {host} that is free",
-            got=f"{port}: {brief(error)}",
-            remedy="give another one, or 0 for any that is free",
-        ) from None
+        expected = f"one of {host} that is free"
+        got = f"{port}: {brief(error)}"
+        remedy = "give another one, or 0 for any that is free"
+        raise InputError("port", expected=expected, got=got, remedy=remedy) from None
 
 
 @contextmanager
-def serving(app: RequestGuard, bound: socket.socket) -> Iterator[None]:
+def serving(app: RequestGuard, bound: socket.socket, *, patience: int = 3) -> Iterator[None]:
     """Serve an application of `create_app` in a thread while the block runs.
 
     The socket is one of `listening`.
+
+    Parameters
+    ----------
+    patience : int, default 3
+        Seconds for which requests are finished at the end.
+
     """
     config = uvicorn.Config(
         app,
@@ -97,7 +99,7 @@ def serving(app: RequestGuard, bound: socket.socket) -> Iterator[None]:
         access_log=False,
         server_header=False,
         limit_concurrency=500,
-        timeout_graceful_shutdown=PATIENCE,
+        timeout_graceful_shutdown=patience,
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, args=([bound],), name="server")

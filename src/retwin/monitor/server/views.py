@@ -40,8 +40,6 @@ from retwin.twins.faults.system_faults import (
 )
 from retwin.update.dynamics.filter.noise import CERTAIN
 
-SILENT = 20
-"""Sample periods without a new sample after which an asset counts as stopped, 30 s at least."""
 SILENT_SECONDS = 30.0
 LEARNED, SHOWN, AFTER = 400, 80, 60
 """Samples before an alarm from which the filter starts anew, those that are shown, and samples
@@ -202,7 +200,8 @@ class Views:
         self._newest[status.asset] = status.time, since
         idle = now - since
         alarm = alarms.get(status.asset)
-        silent = max(SILENT_SECONDS, SILENT / pace(self._live.monitor(status.asset)))
+        # Sample periods without a new sample after which an asset counts as stopped, 30 s at least.
+        silent = max(SILENT_SECONDS, 20 / pace(self._live.monitor(status.asset)))
         states = {
             "alarm": alarm is not None,
             "void": status.void,

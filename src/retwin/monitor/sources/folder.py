@@ -232,13 +232,10 @@ class TrajectoryFolder(Files[Recorded]):
             return []
         begin = int(moments.min())
         place, first = places(moments, begin, twin.rate)  # the first row counts, as of samples
-        require(
-            place.max() < LONGEST,
-            path.name,
-            expected=f"a trajectory of at most {LONGEST} samples at {twin.rate:g} Hz",
-            got=f"times over {place.max() / twin.rate:g} s",
-            remedy="write each trajectory to a file of its own, and check the unit of its times",
-        )
+        expected = f"a trajectory of at most {LONGEST} samples at {twin.rate:g} Hz"
+        got = f"times over {place.max() / twin.rate:g} s"
+        remedy = "write each trajectory to a file of its own, and check the unit of its times"
+        require(place.max() < LONGEST, path.name, expected=expected, got=got, remedy=remedy)
         values = np.full((int(place.max()) + 1, len(channels)), np.nan)
         values[place] = np.concatenate(rows)[first]
         return [Trajectory(asset, begin, values)]

@@ -19,14 +19,10 @@ from retwin.monitor.sources.source import Source
 from retwin.monitor.store.samples import Samples, Trajectory, parse
 from retwin.serialisation.files import refusing
 
-KEEPALIVE = 10
-"""Seconds without a word from the broker after which it is asked whether it is there."""
 RETRY = 1, 4
 """Seconds between attempts to connect, which double from the first to the second."""
 LARGEST = 2**20
 """Bytes of a message at most; the broker keeps larger ones to itself."""
-IN_FLIGHT = 100
-"""Messages that the broker sends before the first of them is acknowledged, at most."""
 
 
 @dataclass(frozen=True)
@@ -114,10 +110,12 @@ class Mqtt(Source):
         client.on_message = lambda _client, _data, message: self._on_message(gate, message)
         asked = properties.Properties(packets.PacketTypes.CONNECT)
         asked.SessionExpiryInterval = own.keep
-        asked.ReceiveMaximum = IN_FLIGHT
+        # Messages that the broker sends before the first of them is acknowledged, at most.
+        asked.ReceiveMaximum = 100
         asked.MaximumPacketSize = LARGEST
         port = own.port or (8883 if own.tls else 1883)
-        client.connect_async(own.host, port, KEEPALIVE, clean_start=False, properties=asked)
+        # Seconds without a word from the broker after which it is asked whether it is there.
+        client.connect_async(own.host, port, 10, clean_start=False, properties=asked)
         return client
 
     def _on_connect(self, client: Any, _data: Any, _flags: Any, code: Any, _: Any) -> None:

@@ -93,14 +93,8 @@ class Assembly:
 
 TIMEOUT = 4.0
 """Seconds in which the server must answer."""
-LONGEST = 1.0
-"""Seconds between two publications, at most."""
-QUEUE = 1000
-"""Values of a node that the server keeps while the connection is lost."""
 FILES = "give the files that the server's administrator made"
 """What to do where one cannot be used."""
-MARGIN = 1.5
-"""Intervals of publication for which a sample waits for channels that may not have changed."""
 
 
 class OpcUa(Source):
@@ -146,7 +140,8 @@ class OpcUa(Source):
             existing(f"sources.{name}", file, there, "a file", remedy=FILES)
         self._password = secret("password of the server", settings.password_env)
         shortest = min(1 / rates[asset] for asset in settings.nodes)
-        self._interval = settings.interval or min(shortest / 2, LONGEST)
+        # Seconds between two publications, at most.
+        self._interval = settings.interval or min(shortest / 2, 1.0)
         self._used: dict[Any, list[tuple[str, int]]] = {}
         """By node, the machines that it belongs to, with the number of the channel."""
         self._assemblies: dict[str, Assembly] = {}
@@ -160,7 +155,9 @@ class OpcUa(Source):
             for name, text in nodes.items():
                 place = (asset, list(channels[asset]).index(name))
                 self._used.setdefault(self._node(text), []).append(place)
-            period, settle = 1 / rates[asset], MARGIN * self._interval
+            # Intervals of publication for which a sample waits for channels that may not have
+            # changed.
+            period, settle = 1 / rates[asset], 1.5 * self._interval
             self._assemblies[asset] = Assembly(len(nodes), period, settle)
 
     def run(self, gate: Gate, stop: threading.Event) -> None:
@@ -186,13 +183,10 @@ class OpcUa(Source):
             self._subscription = subscription
             results = await subscription.create_monitored_items(self._items(subscription))
             for node, result in zip(self._used, results, strict=True):
-                require(
-                    not isinstance(result, self._asyncua.ua.StatusCode),
-                    str(node),
-                    expected="a node of the server",
-                    got=str(result),
-                    remedy="correct its address in the source",
-                )
+                there = not isinstance(result, self._asyncua.ua.StatusCode)
+                expected = "a node of the server"
+                remedy = "correct its address in the source"
+                require(there, str(node), expected=expected, got=str(result), remedy=remedy)
             self._ready = True
             self.back()
             while not stop.is_set():
@@ -247,8 +241,15 @@ class OpcUa(Source):
         with refusing(f"sources.nodes: {text!r}", expected=expected, remedy=remedy):
             return self._asyncua.ua.NodeId.from_string(text)
 
-    def _items(self, subscription: Any) -> list[Any]:
-        """What the server is asked for: each new value or time of each node."""
+    def _items(self, subscription: Any, *, queue: int = 1000) -> list[Any]:
+        """What the server is asked for: each new value or time of each node.
+
+        Parameters
+        ----------
+        queue : int, default 1000
+            Values of a node that the server keeps while the connection is lost.
+
+        """
         ua = self._asyncua.ua
         items = []
         for handle, node in enumerate(self._used, 1):
@@ -259,7 +260,7 @@ class OpcUa(Source):
                 ClientHandle=handle,
                 SamplingInterval=1000 * self._interval,
                 Filter=ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp),
-                QueueSize=QUEUE,
+                QueueSize=queue,
                 DiscardOldest=True,
             )
             items.append(asked)

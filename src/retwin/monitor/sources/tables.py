@@ -35,8 +35,6 @@ CHUNK = 2**16
 """Bytes of a CSV file, and of one of its rows, that are read at once."""
 ROWS = 8192
 """Rows of a Parquet file that are converted at once."""
-TAIL = 256
-"""Bytes before the place up to which a file was read that are compared before it is read on."""
 NEVER = -(2**63)
 """Time in ns of a command that was not measured yet."""
 
@@ -141,13 +139,11 @@ def _in_unit_of(
     name, own, unit = channel
     where = f"{place}, {own.signals[0]}"
     made, target, _ = in_unit(signal.values, own, signal.unit, unit, where)
-    require(
-        unit is not None or own.unit or same_unit(target, "1"),
-        where,
-        expected=f"the unit of {name}, of which the twin states none",
-        got=f"that of the table alone, {target}",
-        remedy=f"write unit = … for {name} in the mapping, the unit of its calibration data",
-    )
+    stated = unit is not None or own.unit or same_unit(target, "1")
+    expected = f"the unit of {name}, of which the twin states none"
+    got = f"that of the table alone, {target}"
+    remedy = f"write unit = … for {name} in the mapping, the unit of its calibration data"
+    require(stated, where, expected=expected, got=got, remedy=remedy)
     return made
 
 
@@ -244,8 +240,16 @@ class Csv(GrowingTable):
         file.seek(place.offset - len(place.tail))
         return place if file.read(len(place.tail)) == place.tail else _Place()
 
-    def _parse(self, text: bytes, place: _Place) -> Rows | None:
-        """Complete lines after a place; None if they hold no row yet."""
+    def _parse(self, text: bytes, place: _Place, *, tail: int = 256) -> Rows | None:
+        """Complete lines after a place; None if they hold no row yet.
+
+        Parameters
+        ----------
+        tail : int, default 256
+            Bytes before the place up to which a file was read that are compared before it is read
+            on.
+
+        """
         layout, name = place.layout, self.path.name
         encoding = layout.encoding if layout else encoding_of(text)
         if encoding == "utf-16":  # the end of a row is not found by its bytes
@@ -272,7 +276,7 @@ class Csv(GrowingTable):
             for at in [layout.column(each)]
         }
         since = np.full(self.layout.commands, NEVER) if place.since is None else place.since.copy()
-        end = _Place(place.offset + len(text), (place.tail + text)[-TAIL:], layout, since)
+        end = _Place(place.offset + len(text), (place.tail + text)[-tail:], layout, since)
         made = self.layout.rows(text_table(name, layout, len(rows), columns), since, end)
         return replace(made, bad=bad + made.bad)
 
@@ -382,11 +386,8 @@ def mapped_layout(
 
 def _same(found: list[Any], what: str, default: Any) -> Any:
     """What all records of a case have in common, or the default where there are none."""
-    require(
-        all(each == found[0] for each in found),
-        f"sources.{what}",
-        expected=f"the {what} of the files",
-        got="none, and records of the case that differ in it",
-        remedy=f"give `{what}` in the source",
-    )
+    agree = all(each == found[0] for each in found)
+    got = "none, and records of the case that differ in it"
+    remedy = f"give `{what}` in the source"
+    require(agree, f"sources.{what}", expected=f"the {what} of the files", got=got, remedy=remedy)
     return found[0] if found else default

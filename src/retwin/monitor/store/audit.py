@@ -24,8 +24,6 @@ START = "0" * 64
 """The previous hash of the first entry."""
 MAX_LINE = 2**20
 """Bytes of an entry at most, so that a file is read in bounded memory."""
-MAX_DEPTH = 32
-"""Levels of nested values at most."""
 KIND = re.compile(r"[a-z][a-z_]{0,39}")
 """What the kind of an entry may be."""
 KEYS = {"data", "hash", "kind", "previous", "sequence"}
@@ -144,13 +142,10 @@ def append(last: Entry | None, kind: str, data: Mapping[str, Any]) -> Entry:
         The kind is not in lower-case letters and underscores, or `canonical` raises it.
 
     """
-    require(
-        isinstance(kind, str) and KIND.fullmatch(kind),
-        "kind",
-        expected="at most 40 lower-case letters and underscores",
-        got=repr(kind)[:80],
-        remedy="name the kind of entry by a word",
-    )
+    fits = isinstance(kind, str) and KIND.fullmatch(kind)
+    expected = "at most 40 lower-case letters and underscores"
+    got = repr(kind)[:80]
+    require(fits, "kind", expected=expected, got=got, remedy="name the kind of entry by a word")
     sequence, previous = (0, START) if last is None else (last.sequence + 1, last.hash)
     entry = Entry(sequence, kind, canonical(data), previous, "")
     return Entry(sequence, kind, entry.text, previous, entry.digest())
@@ -289,11 +284,18 @@ def _chained_anew(entries: Iterable[Entry], kind: str, order: Sequence[str]) -> 
         yield last
 
 
-def _check(value: Any, depth: int) -> None:
-    """Raise InputError unless JSON represents the value exactly."""
+def _check(value: Any, depth: int, *, max_depth: int = 32) -> None:
+    """Raise InputError unless JSON represents the value exactly.
+
+    Parameters
+    ----------
+    max_depth : int, default 32
+        Levels of nested values at most.
+
+    """
     remedy = "log finite numbers, texts, true, false, null, lists, and objects with texts as keys"
     named = repr(value) if isinstance(value, float) else type(value).__name__
-    expected = f"values of JSON, at most {MAX_DEPTH} levels of them"
+    expected = f"values of JSON, at most {max_depth} levels of them"
     fits = value is None or isinstance(value, str | bool | list | tuple | dict)
     if isinstance(value, float):
         fits = abs(value) < float("inf")
@@ -305,7 +307,7 @@ def _check(value: Any, depth: int) -> None:
         named = "an object with a key that is no text"
     elif isinstance(value, list | tuple):
         inside = value
-    fits = fits and depth <= MAX_DEPTH
+    fits = fits and depth <= max_depth
     require(fits, "data", expected=expected, got=named, remedy=remedy)
     for each in inside:
         _check(each, depth + 1)

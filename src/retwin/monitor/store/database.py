@@ -26,8 +26,6 @@ WRITER = 0x72657477696E
 """The number of the lock that the one process that writes holds in PostgreSQL: "retwin"."""
 PATIENCE = 5.0
 """Seconds for which a lock inside SQLite is waited for."""
-RELEASE = 2.0
-"""Seconds in which PostgreSQL notices that a process ended, and frees its lock."""
 PRAGMAS = {
     "journal_mode": "wal",
     "synchronous": 2,  # FULL: each commit is flushed to the disk
@@ -40,8 +38,6 @@ PRAGMAS = {
 SERVER = {"fsync": "on", "full_page_writes": "on", "synchronous_commit": "on"}
 """Settings of PostgreSQL without which a commit is not durable."""
 
-AT_ONCE = 500
-"""Times that are looked for at once; a query has a limit."""
 TABLES = sa.MetaData()
 meta = sa.Table(
     "retwin_meta",
@@ -180,13 +176,11 @@ class Database:
             yield
         except sa.exc.SQLAlchemyError as error:
             cause = getattr(error, "orig", None) or error
-            raise InputError(
-                self.name,
-                expected="a database that stores and reads",
-                got=f"{type(cause).__name__}: {brief(cause)}",
-                remedy="nothing of this step was acknowledged: check its free disk space, its "
-                "rights and its server, and repeat the step",
-            ) from None
+            expected = "a database that stores and reads"
+            got = f"{type(cause).__name__}: {brief(cause)}"
+            remedy = "nothing of this step was acknowledged: check its free disk space, its "
+            remedy += "rights and its server, and repeat the step"
+            raise InputError(self.name, expected=expected, got=got, remedy=remedy) from None
 
     def shrink(self) -> None:
         """Give the pages of removed rows back: to the disk in SQLite, to new rows in PostgreSQL."""
@@ -202,35 +196,35 @@ class Database:
     def _check_schema(self, connection: Any) -> None:
         row = connection.execute(meta.select().where(meta.c.key == "schema")).one_or_none()
         found = row.value if row is not None else str(SCHEMA)
-        require(
-            found == str(SCHEMA),
-            self.name,
-            expected=f"a store of schema {SCHEMA}",
-            got=f"schema {found[:20]}",
-            remedy="open it with the version of retwin that wrote it, or a newer one",
-        )
+        expected = f"a store of schema {SCHEMA}"
+        got = f"schema {found[:20]}"
+        remedy = "open it with the version of retwin that wrote it, or a newer one"
+        require(found == str(SCHEMA), self.name, expected=expected, got=got, remedy=remedy)
 
-    def _hold(self) -> None:
+    def _hold(self, *, release: float = 2.0) -> None:
         """Take the lock of the process that writes, which ends with the connection.
 
         In SQLite the lock on the store's folder does that.
+
+        Parameters
+        ----------
+        release : float, default 2.0
+            Seconds in which PostgreSQL notices that a process ended, and frees its lock.
+
         """
         if self._sqlite:
             return
         ask = sa.text(f"SELECT pg_try_advisory_lock({WRITER})")
-        until = time.monotonic() + RELEASE
+        until = time.monotonic() + release
         while not (held := self._writer.execute(ask).scalar_one()) and time.monotonic() < until:
             time.sleep(0.1)
         self._writer.commit()
         if not held:
             self._drop()
-        require(
-            held,
-            self.name,
-            expected="a store that no other process writes to",
-            got="one that a process writes to now",
-            remedy="wait until it has ended, open it with read_only, or give another database",
-        )
+        expected = "a store that no other process writes to"
+        got = "one that a process writes to now"
+        remedy = "wait until it has ended, open it with read_only, or give another database"
+        require(held, self.name, expected=expected, got=got, remedy=remedy)
 
     def _drop(self) -> None:
         self._writer.invalidate()
@@ -265,11 +259,18 @@ class Database:
         nothing(self.name, wrong, expected, remedy=remedy)
 
 
-def present(connection: Any, key: int, times: NDArray) -> NDArray:
-    """Those of the times that samples of an asset have; others between them are not read."""
+def present(connection: Any, key: int, times: NDArray, *, at_once: int = 500) -> NDArray:
+    """Those of the times that samples of an asset have; others between them are not read.
+
+    Parameters
+    ----------
+    at_once : int, default 500
+        Times that are looked for at once; a query has a limit.
+
+    """
     found: list[int] = []
-    for first in range(0, len(times), AT_ONCE):
-        chosen = samples.c.time.in_(times[first : first + AT_ONCE].tolist())
+    for first in range(0, len(times), at_once):
+        chosen = samples.c.time.in_(times[first : first + at_once].tolist())
         own = sa.select(samples.c.time).where(samples.c.asset == key, chosen)
         found += connection.execute(own).scalars().all()
     return np.array(found, dtype=np.int64)
@@ -286,11 +287,8 @@ def _address(url: str) -> Any:
         address = sa.make_url(url)
     except sa.exc.ArgumentError:
         address = sa.URL.create("none")
-    require(
-        address.get_backend_name() in ("postgresql", "postgres"),
-        "url",
-        expected="a PostgreSQL database, postgresql://user@host/name",
-        got="another address",
-        remedy="correct it, or leave it out for SQLite in the folder",
-    )
+    postgresql = address.get_backend_name() in ("postgresql", "postgres")
+    expected = "a PostgreSQL database, postgresql://user@host/name"
+    remedy = "correct it, or leave it out for SQLite in the folder"
+    require(postgresql, "url", expected=expected, got="another address", remedy=remedy)
     return address.set(drivername="postgresql+psycopg")

@@ -256,13 +256,10 @@ def parse(
         length = max((len(column) for column in columns if isinstance(column, list)), default=0)
         count += max(1, length)
         at_most("samples", count, LONGEST, "in a document", remedy="send them in parts")
-        require(
-            isinstance(each, dict) and needed <= each.keys() <= KEYS,
-            place,
-            expected=f"an object with {', '.join(sorted(needed))} and time",
-            got=f"{type(each).__name__} {repr(each)[:60]}",
-            remedy=REMEDY,
-        )
+        fits = isinstance(each, dict) and needed <= each.keys() <= KEYS
+        expected = f"an object with {', '.join(sorted(needed))} and time"
+        got = f"{type(each).__name__} {repr(each)[:60]}"
+        require(fits, place, expected=expected, got=got, remedy=REMEDY)
         name = each.get("asset", asset)
         if not isinstance(name, str) or asset not in (None, name):
             raise _refused(f"{place}: asset", name, "its name" if asset is None else repr(asset))

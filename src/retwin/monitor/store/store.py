@@ -45,8 +45,6 @@ FILE = "monitor.sqlite"
 """The database in the folder of the store, where no other is given."""
 ROWS = 4096
 """Rows that are read at once."""
-SURPLUS = 0.1
-"""Share of `max_samples` by which an asset may exceed it, so that samples are removed in groups."""
 
 
 class Store:
@@ -132,13 +130,10 @@ class Store:
 
         """
         name = instance("name", asset.name, str, remedy="give the asset's name as text")
-        require(
-            0 < len(name) <= 200 and name.isprintable(),
-            "name",
-            expected="from 1 to 200 printable characters",
-            got=repr(name[:80]),
-            remedy="rename the asset",
-        )
+        printable = 0 < len(name) <= 200 and name.isprintable()
+        expected = "from 1 to 200 printable characters"
+        got = repr(name[:80])
+        require(printable, "name", expected=expected, got=got, remedy="rename the asset")
         if asset.version is not None:
             whole("version", asset.version, at_most=2**31 - 1)
         row = {
@@ -151,13 +146,10 @@ class Store:
             if known is None:
                 connection.execute(assets.insert().values(name=name, **row))
             else:
-                require(
-                    known[1] == asset.channels,
-                    "channels",
-                    expected=f"{known[1]}, as the asset {name} has",
-                    got=asset.channels,
-                    remedy="add the machine under another name",
-                )
+                same = known[1] == asset.channels
+                expected = f"{known[1]}, as the asset {name} has"
+                remedy = "add the machine under another name"
+                require(same, "channels", expected=expected, got=asset.channels, remedy=remedy)
                 connection.execute(assets.update().where(assets.c.id == known[0]).values(row))
             self._assets = None
 
@@ -309,13 +301,10 @@ class Store:
     @contextmanager
     def _writing(self) -> Iterator[Any]:
         """The connection that writes, in a transaction; what is known of it is read again later."""
-        require(
-            not self.read_only,
-            "store",
-            expected="one that was opened to write",
-            got="one that was opened to read only",
-            remedy="open it without read_only",
-        )
+        expected = "one that was opened to write"
+        got = "one that was opened to read only"
+        remedy = "open it without read_only"
+        require(not self.read_only, "store", expected=expected, got=got, remedy=remedy)
         with self.lock:
             try:
                 with self._database.writer() as connection:
@@ -355,10 +344,18 @@ class Store:
             self._held[key] = _Held(count, EARLIEST if latest is None else latest)
         return self._held[key]
 
-    def _remove_surplus(self, connection: Any, key: int) -> None:
-        """Remove the oldest samples of an asset that has too many."""
+    def _remove_surplus(self, connection: Any, key: int, *, surplus: float = 0.1) -> None:
+        """Remove the oldest samples of an asset that has too many.
+
+        Parameters
+        ----------
+        surplus : float, default 0.1
+            Share of `max_samples` by which an asset may exceed it, so that samples are removed in
+            groups.
+
+        """
         held = self._held_by(connection, key)
-        if self._max_samples is None or held.count <= self._max_samples * (1 + SURPLUS):
+        if self._max_samples is None or held.count <= self._max_samples * (1 + surplus):
             return
         own = samples.c.asset == key
         times = sa.select(samples.c.time).where(own).order_by(samples.c.time)

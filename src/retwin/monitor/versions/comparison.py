@@ -32,15 +32,9 @@ from retwin.scores.distributions import crps_normal
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 
-MAX_SAMPLES = 20_000
-"""Newest samples of each asset that are compared, which bounds time and memory."""
 MIN_TRAJECTORIES, MAX_TRAJECTORIES = 2 * BLOCKS, 6 * BLOCKS
 """Healthy trajectories of all assets together that are compared: at least, so that a block of the
 bootstrap has two, and at most, since diagnosing each may take seconds."""
-TRAJECTORIES_BEFORE = 10
-"""Trajectories before an alarm that are left out: its cause may already act in them."""
-DRAWS = 200
-"""Simulations of each trajectory; the CRPS has no bias by their number."""
 FRESH, PATIENCE, QUEUE = 60.0, 20.0, 16
 """A comparison is kept for so many seconds, or for so many times as long as it took, whichever is
 longer; and comparisons that may be made or kept."""
@@ -83,13 +77,10 @@ def compare(store: Store, twin: str, number: int) -> Decision:
     remedy = "promote the first version"
     active = given("versions", registry.active, "an active version", remedy=remedy)
     old, new = (load_monitor(registry.folder(each)) for each in (active.number, number))
-    require(
-        type(old) is type(new),
-        f"version {number}",
-        expected=f"a monitor of {KINDS[type(old)]}, as version {active.number} is",
-        got=f"one of {KINDS[type(new)]}",
-        remedy="reject it, and watch its machine under the name of a new twin",
-    )
+    expected = f"a monitor of {KINDS[type(old)]}, as version {active.number} is"
+    got = f"one of {KINDS[type(new)]}"
+    remedy = "reject it, and watch its machine under the name of a new twin"
+    require(type(old) is type(new), f"version {number}", expected=expected, got=got, remedy=remedy)
     whose, remedy = f"that of version {active.number}", "fit it to records of the same machine"
     agree(f"version {number}", new.twin, old.twin, whose, remedy=remedy)
     first = registry.reference
@@ -176,7 +167,8 @@ def _healthy_samples(store: Store, twin: str, monitor: Monitor) -> Iterator[NDAr
     alarms = collect_times(store, "time", "alarm", "remark", "end")
     period = SECOND / monitor.twin.rate
     for name, newest, _ in _machines(store, twin):
-        first = newest - round(MAX_SAMPLES * period)
+        # Newest samples of each asset that are compared, which bounds time and memory.
+        first = newest - round(20_000 * period)
         times, rows = gridded(store, name, monitor.twin, first, newest)
         ends = np.searchsorted(times, sorted(alarms.get(name, [])))
         ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))
@@ -197,18 +189,24 @@ def _tested(monitor: TrajectoryMonitor, machines: list[list[Trajectories]]) -> F
 
 
 def _healthy_trajectories(
-    store: Store, twin: str, monitor: TrajectoryMonitor
+    store: Store, twin: str, monitor: TrajectoryMonitor, *, trajectories_before: int = 10
 ) -> Iterator[list[NDArray]]:
     """The longest healthy part of each asset: trajectories (T, d_u + d_y) that follow each other.
 
     Those with nothing measured are left out.
+
+    Parameters
+    ----------
+    trajectories_before : int, default 10
+        Trajectories before an alarm that are left out: its cause may already act in them.
+
     """
     alarms, machines = collect_times(store, "begin", "alarm"), list(_machines(store, twin))
     for asset, _, state in machines:
         known = state.get("trajectories", np.zeros((0, 3), dtype=np.int64))
         ends = np.flatnonzero(np.isin(known[:, 0], alarms.get(asset, [])))
         begins = np.concatenate([[0], ends + 1])
-        lasts = np.maximum(np.concatenate([ends - TRAJECTORIES_BEFORE, [len(known)]]), begins)
+        lasts = np.maximum(np.concatenate([ends - trajectories_before, [len(known)]]), begins)
         longest = int(np.argmax(lasts - begins))
         part = known[begins[longest] : lasts[longest]][-max(1, MAX_TRAJECTORIES // len(machines)) :]
         made = []
@@ -233,11 +231,18 @@ def _deviation(measured: NDArray) -> NDArray:
     return np.where(found > 0, found, 1.0)
 
 
-def _crps(twin: Twin, record: Trajectories, unit: NDArray) -> float:
-    """The mean CRPS of a trajectory over its measured samples and outputs."""
+def _crps(twin: Twin, record: Trajectories, unit: NDArray, *, draws: int = 200) -> float:
+    """The mean CRPS of a trajectory over its measured samples and outputs.
+
+    Parameters
+    ----------
+    draws : int, default 200
+        Simulations of each trajectory; the CRPS has no bias by their number.
+
+    """
     with warnings.catch_warnings():  # both versions see the same commands
         warnings.simplefilter("ignore")
-        found = simulate_records(twin, record, draws=DRAWS, seed=0).crps[0] / unit
+        found = simulate_records(twin, record, draws=draws, seed=0).crps[0] / unit
     return float(found[record.mask[0]].mean())
 
 

@@ -14,8 +14,6 @@ from retwin.scores.bootstrap import BLOCKS, MIN_RECORDS, bootstrap_means
 
 MIN_SAMPLES = 10 * BLOCKS
 """Samples of a record at least, so that a block of the bootstrap has ten."""
-DRAWS = 4000
-"""Bootstrap draws of the mean difference, whose standard deviation they give to about 1 %."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +86,7 @@ def decide(
     *,
     reference: FalseAlarmTest | None = None,
     seed: int = 0,
+    resamplings: int = 4000,
 ) -> Decision:
     """Compare two versions on the same samples.
 
@@ -102,6 +101,8 @@ def decide(
         Those of the first active version, see `Decision`.
     seed : int
         Seed of the bootstrap.
+    resamplings : int, default 4000
+        Bootstrap draws of the mean difference, whose standard deviation they give to about 1 %.
 
     Raises
     ------
@@ -119,32 +120,22 @@ def decide(
     from scipy.special import stdtrit
 
     old, new = (np.atleast_2d(np.asarray(each, dtype=float)) for each in (old_crps, new_crps))
-    require(
-        old.shape == new.shape and old.ndim == 2 and np.array_equal(np.isnan(old), np.isnan(new)),
-        "new_crps",
-        expected=f"CRPS of the same samples as old_crps, {old.shape}",
-        got=f"{new.shape}, or other samples",
-        remedy="score both versions on the same samples",
-    )
+    same = old.shape == new.shape and old.ndim == 2 and np.array_equal(np.isnan(old), np.isnan(new))
+    expected = f"CRPS of the same samples as old_crps, {old.shape}"
+    got = f"{new.shape}, or other samples"
+    remedy = "score both versions on the same samples"
+    require(same, "new_crps", expected=expected, got=got, remedy=remedy)
     present = np.isfinite(old) & np.isfinite(new)
-    require(
-        (present | np.isnan(old)).all(),
-        "crps",
-        expected="finite scores, NaN where a sample is missing",
-        got="infinite ones",
-        remedy="find out which samples have such predictions",
-    )
+    expected = "finite scores, NaN where a sample is missing"
+    got = "infinite ones"
+    remedy = "find out which samples have such predictions"
+    require((present | np.isnan(old)).all(), "crps", expected=expected, got=got, remedy=remedy)
     fewest = int(present.sum(axis=1).min(initial=old.shape[1])) if len(old) else 0
     least = MIN_SAMPLES if len(old) < MIN_RECORDS else 1
-    require(
-        fewest >= least,
-        "crps",
-        expected=f"at least {least} samples of each record",
-        got=fewest,
-        remedy="collect more samples",
-    )
+    expected = f"at least {least} samples of each record"
+    require(fewest >= least, "crps", expected=expected, got=fewest, remedy="collect more samples")
     difference = (old - new)[:, :, None]
-    draws = bootstrap_means(difference, draws=DRAWS, seed=seed)
+    draws = bootstrap_means(difference, draws=resamplings, seed=seed)
     mean = float(np.nanmean(difference, axis=1).mean())
     scale = 1.96  # of many records: the draws are already as wide as Student's interval
     if len(old) < MIN_RECORDS:

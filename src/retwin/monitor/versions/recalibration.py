@@ -66,14 +66,11 @@ def recalibrate(store: Store, asset: str, *, hours: float = 24.0, new_normal: st
     parts = _parts(times, rows, quiet, round(BEFORE * SECOND / monitor.twin.rate))
     inputs = len(monitor.twin.inputs)
     seen = sum(int(np.isfinite(each[:, inputs:]).any(axis=1).sum()) for each in parts)
-    require(
-        seen >= 2 * MIN_SAMPLES,
-        "samples",
-        expected=f"at least {2 * MIN_SAMPLES / monitor.twin.rate:g} s outside of events in the "
-        f"last {span:g} h",
-        got=f"{seen / monitor.twin.rate:g} s",
-        remedy="wait until the machine has run for longer without an event",
-    )
+    expected = f"at least {2 * MIN_SAMPLES / monitor.twin.rate:g} s outside of events in the "
+    expected += f"last {span:g} h"
+    got = f"{seen / monitor.twin.rate:g} s"
+    remedy = "wait until the machine has run for longer without an event"
+    require(seen >= 2 * MIN_SAMPLES, "samples", expected=expected, got=got, remedy=remedy)
     records = [record_of(monitor.twin, each) for each in parts]
     names = [f"quiet part {i + 1}" for i in range(len(records))]
     healthy = Trajectories.concatenate(

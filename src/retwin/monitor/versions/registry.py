@@ -183,14 +183,10 @@ class Registry:
             if self.active is None:
                 return self._step("promote", number, first=True)
             decision = instance("evidence", evidence, Decision, remedy="compare both with decide()")
-            require(
-                decision.better,
-                "evidence",
-                expected="a difference in CRPS whose 95 % interval is above 0, and alarms as "
-                "promised",
-                got=decision.summary,
-                remedy="keep the active version, or collect more samples",
-            )
+            expected = "a difference in CRPS whose 95 % interval is above 0, and alarms as promised"
+            got = decision.summary
+            remedy = "keep the active version, or collect more samples"
+            require(decision.better, "evidence", expected=expected, got=got, remedy=remedy)
             return self._step("promote", number, evidence=asdict(decision))
 
     def rollback(self, reason: str = "") -> Version:
@@ -235,13 +231,11 @@ class Registry:
         with self._store.lock:
             version = self._version(number)
             allowed = BEFORE[step] + (("proposed",) if first else ())
-            require(
-                version.state in allowed,
-                f"version {number}",
-                expected=f"one that is {' or '.join(allowed)}, to {step} it",
-                got=f"one that is {version.state}",
-                remedy="see versions()",
-            )
+            possible = version.state in allowed
+            expected = f"one that is {' or '.join(allowed)}, to {step} it"
+            got = f"one that is {version.state}"
+            remedy = "see versions()"
+            require(possible, f"version {number}", expected=expected, got=got, remedy=remedy)
             if AFTER[step] != "rejected":
                 self.folder(number)
             self._log(step, number, **more)
@@ -283,13 +277,10 @@ class Registry:
                     _copy_file(file, part / file.relative_to(source))
                 for folder in (part, *(each for each in part.rglob("*") if each.is_dir())):
                     _flush(folder)
-                require(
-                    sha256(part) == digest,
-                    "folder",
-                    expected="a folder that does not change",
-                    got=f"{source}, which changed while it was copied",
-                    remedy="propose it again",
-                )
+                expected = "a folder that does not change"
+                got = f"{source}, which changed while it was copied"
+                remedy = "propose it again"
+                require(sha256(part) == digest, "folder", expected=expected, got=got, remedy=remedy)
         _flush(place.parent)
         _flush(self._store.folder)
         return digest
@@ -337,13 +328,11 @@ def _files(folder: Path) -> Iterator[Path]:
         if each.name.startswith("."):
             continue
         mode = each.lstat().st_mode
-        require(
-            stat.S_ISDIR(mode) or stat.S_ISREG(mode),
-            "folder",
-            expected="a folder of files, without links",
-            got=f"{each.name[:80]!r}, which is a link or a device",
-            remedy="save the model again into a new folder",
-        )
+        plain = stat.S_ISDIR(mode) or stat.S_ISREG(mode)
+        expected = "a folder of files, without links"
+        got = f"{each.name[:80]!r}, which is a link or a device"
+        remedy = "save the model again into a new folder"
+        require(plain, "folder", expected=expected, got=got, remedy=remedy)
         if stat.S_ISDIR(mode):
             yield from _files(each)
         else:

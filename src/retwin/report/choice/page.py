@@ -11,7 +11,7 @@ from retwin.report.assets import environment, render_page
 from retwin.report.blocks import Table, tabulate
 from retwin.report.choice import tables
 from retwin.report.figures.figure import Band, Figure, Key, Line, Mark, record_panel
-from retwin.report.identification.figures import OUTPUTS, SAMPLES
+from retwin.report.identification.page import OUTPUTS, SAMPLES
 from retwin.report.labels import significant
 from retwin.report.records import TITLE, records_part
 from retwin.update.forecast_errors import BEYOND, USUAL

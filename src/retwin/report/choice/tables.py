@@ -13,11 +13,6 @@ from retwin.report.labels import behind, duration, significant
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.residual import ResidualModel, StationaryResidual
 
-LARGEST = 8
-"""Number of terms of the state equations that are shown."""
-SIGNIFICANT = 0.05
-"""p-value below which errors are not taken for white noise."""
-
 
 def units_of(found: Fitted) -> dict[str, str]:
     """The units of the outputs, as they stand behind a number."""
@@ -72,17 +67,31 @@ def parameter_table(found: Fitted) -> Table:
     return tabulate("Parameters", ["parameter", "before", "identified", "in the model"], rows)
 
 
-def term_table(found: Fitted) -> Table:
-    """The largest terms that state equations learned."""
+def term_table(found: Fitted, *, largest: int = 8) -> Table:
+    """The largest terms that state equations learned.
+
+    Parameters
+    ----------
+    largest : int, default 8
+        Number of terms of the state equations that are shown.
+
+    """
     terms = {} if found.learned is None else found.learned.terms
-    rows = [[name, f"{size:.3f}"] for name, size in list(terms.items())[:LARGEST]]
+    rows = [[name, f"{size:.3f}"] for name, size in list(terms.items())[:largest]]
     title = "The largest terms, over the usual time derivative of their state; variables are in "
     title += "standard deviations from their means"
     return tabulate(title, ["term", "size"], rows)
 
 
-def model_sentences(found: Fitted) -> list[str]:
-    """What the model was trained on, and whether its one-step errors are white noise."""
+def model_sentences(found: Fitted, *, significant: float = 0.05) -> list[str]:
+    """What the model was trained on, and whether its one-step errors are white noise.
+
+    Parameters
+    ----------
+    significant : float, default 0.05
+        P-value below which errors are not taken for white noise.
+
+    """
     residual = found.twin.residual if isinstance(found.twin, CorrectedTwin) else None
     fitted = None if residual is None else residual.fitted
     covered, latent = [], {}
@@ -98,5 +107,5 @@ def model_sentences(found: Fitted) -> list[str]:
         covered=covered,
         latent=latent,
         one_step_errors=found.one_step_errors,
-        significant=SIGNIFICANT,
+        significant=significant,
     )

@@ -12,9 +12,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-MAX_POINTS = 4000
-"""Samples beyond which a line is drawn as the smallest and the largest value of groups."""
-
 
 @dataclass(frozen=True)
 class Line:
@@ -265,14 +262,21 @@ def record_panel(
     return Panel(x, [Row(Axis(name, unit), marks)], f"{title} over time", title, height=height)
 
 
-def envelope(mark: Mark) -> Mark:
-    """A line or a band of very many samples as its extremes in groups, so that no peak is lost."""
-    if not isinstance(mark, Line | Band) or len(np.asarray(mark.x)) <= MAX_POINTS:
+def envelope(mark: Mark, *, max_points: int = 4000) -> Mark:
+    """A line or a band of very many samples as its extremes in groups, so that no peak is lost.
+
+    Parameters
+    ----------
+    max_points : int, default 4000
+        Samples beyond which a line is drawn as the smallest and the largest value of groups.
+
+    """
+    if not isinstance(mark, Line | Band) or len(np.asarray(mark.x)) <= max_points:
         return mark
     x = np.asarray(mark.x, dtype=float)
     if np.any(np.diff(x) < 0):
         return mark
-    starts = np.linspace(0, len(x), MAX_POINTS // 2 + 1).astype(int)[:-1]
+    starts = np.linspace(0, len(x), max_points // 2 + 1).astype(int)[:-1]
 
     def extremes(least: ArrayLike, greatest: ArrayLike) -> list[NDArray]:
         pairs = ((np.fmin, least), (np.fmax, greatest))

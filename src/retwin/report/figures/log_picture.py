@@ -11,8 +11,6 @@ from retwin.report.figures.figure import Axis, Figure, Key, Line, Mark, Panel, R
 from retwin.report.figures.png import png
 from retwin.report.labels import counted
 
-MAX_ROWS = 16
-"""Signals that are drawn at most."""
 COMMAND, OUTPUT = "c1", "c0"
 KEYS = (
     Key("value of the log", "observed"),
@@ -22,7 +20,7 @@ KEYS = (
 )
 
 
-def log_picture(log: Log, tried: Parts | str) -> bytes:
+def log_picture(log: Log, tried: Parts | str, *, max_rows: int = 16) -> bytes:
     """The signals of a log as PNG, above each other, with the trajectories that a mapping makes.
 
     Trajectories are shaded, and their samples are drawn over the values of the log. Samples that
@@ -34,6 +32,8 @@ def log_picture(log: Log, tried: Parts | str) -> bytes:
         The signals.
     tried : Parts or str
         The trajectories; or why there are none, and the first signals are drawn alone.
+    max_rows : int, default 16
+        Signals that are drawn at most.
 
     """
     if isinstance(tried, str):
@@ -41,14 +41,14 @@ def log_picture(log: Log, tried: Parts | str) -> bytes:
         names = list(log.signals)
         marks: list[list[Mark]] = [
             [Line(each.times, each.values, each.name, OUTPUT, width=1.1)]
-            for each in list(log.signals.values())[:MAX_ROWS]
+            for each in list(log.signals.values())[:max_rows]
         ]
     else:
         title = f"{counted(len(tried.blocks), 'trajectory')} at {tried.rate:g} Hz"
         names = [f"{each.name} [{each.unit}]" for each in tried.every]
-        marks = [_marks(tried, column) for column in range(min(len(names), MAX_ROWS))]
-    if len(names) > MAX_ROWS:
-        title += f"; {len(names) - MAX_ROWS} more signals are not drawn"
+        marks = [_marks(tried, column) for column in range(min(len(names), max_rows))]
+    if len(names) > max_rows:
+        title += f"; {len(names) - max_rows} more signals are not drawn"
     limits = (-0.02 * log.end, max(1.02 * log.end, 1e-9))
     last = Axis("time since the first value of the log", "s", limits)
     panels = [

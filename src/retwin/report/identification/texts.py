@@ -20,18 +20,8 @@ MATERIAL = 0.1
 """Correlation of residuals below which it changes hardly anything, however sure it is."""
 SENTENCES = 4
 """Outputs that have a sentence of their own, at most."""
-SMALL = 0.02
-"""Ratio of errors below which a change in percent has decimals."""
-SMALL_SHARE = 0.01
-"""Share of a range below which it is given with more digits."""
-ELSEWHERE = 2.0
-"""Ratio of the errors at the begin of trajectories and later, from which it is named."""
-STRONG = 0.95
-"""Correlation of two estimates from which they are named."""
 OWN_START = "mean of the records"
 """What a start is of which each record has its own."""
-MISFIT = 0.02
-"""Prior predictive p-value below which measurements do not fit the twin."""
 
 
 def value(each: ParameterEstimate) -> str:
@@ -73,9 +63,16 @@ def state(each: ParameterEstimate) -> str:
     return f"not identified: interval covers {_share(each.covered)} of the range{leaves}"
 
 
-def _share(share: float) -> str:
-    """`38 %`; below one percent with a digit."""
-    return f"{100 * share:.2g} %" if share < SMALL_SHARE else f"{100 * share:.0f} %"
+def _share(share: float, *, small_share: float = 0.01) -> str:
+    """`38 %`; below one percent with a digit.
+
+    Parameters
+    ----------
+    small_share : float, default 0.01
+        Share of a range below which it is given with more digits.
+
+    """
+    return f"{100 * share:.2g} %" if share < small_share else f"{100 * share:.0f} %"
 
 
 def combination(direction: Direction) -> str:
@@ -97,7 +94,8 @@ def change(error: RMSError, *, interval: bool = True) -> str:
 
 def percent(ratio: float) -> str:
     """`−86` for a ratio of 0.14; with two decimals where little is left."""
-    return f"{100 * (ratio - 1):+.{2 if ratio < SMALL else 0}f}".replace("-", "−")
+    # Ratio of errors below which a change in percent has decimals.
+    return f"{100 * (ratio - 1):+.{2 if ratio < 0.02 else 0}f}".replace("-", "−")
 
 
 def interval_remark(found: Identification) -> str:
@@ -147,10 +145,13 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
     pairs = [
         (names[j], names[i], found.correlation[i, j]) for i in range(len(names)) for j in range(i)
     ]
-    strong = [f"{a} and {b} ({signed(r, 2)})" for a, b, r in pairs if abs(r) > STRONG]
+    # Correlation of two estimates from which they are named.
+    strong = [f"{a} and {b} ({signed(r, 2)})" for a, b, r in pairs if abs(r) > 0.95]
     means = {each.name: each.mean for each in found.outputs}
     unknown = [p for p in found.parameters if not (p.identified or p.at_bound or p.depends)]
     measured = found.simulated["identification"][0]
+    # Ratio of the errors at the begin of trajectories and later, from which it is named.
+    # Prior predictive p-value below which measurements do not fit the twin.
     return sentences(
         "findings",
         found=found,
@@ -171,7 +172,7 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
         worse=[name for name, each in errors if each.after >= means[name]],
         whole=next((each.error for each in horizons if each.length is None), None),
         settable=state_based(found.twin),
-        larger=[pair for pair in found.begin_errors.items() if pair[1] > ELSEWHERE],
+        larger=[pair for pair in found.begin_errors.items() if pair[1] > 2.0],
         tenth=float(f"{measured.lengths.max() / measured.rate / BEGIN:.2g}"),
         started=any(each.name.startswith("start_") for each in found.parameters),
         own=[each.name for each in found.parameters if each.own],
@@ -187,7 +188,7 @@ def findings(found: Identification, notes: Sequence[str] = ()) -> list[str]:
         coloured=_coloured(found),
         white=WHITE,
         driven=_driven(found)[: 2 * SENTENCES],
-        misfit=MISFIT,
+        misfit=0.02,
         without_error=any(isnan(p.error) and not p.at_bound for p in found.parameters),
     )
 

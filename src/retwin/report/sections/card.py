@@ -15,13 +15,6 @@ from retwin.report.verdict import headline
 from retwin.results import ChannelNames, Dataset, FidelityFigure, Results
 from retwin.scores.classification import row_shares
 
-SIGNIFICANT = 0.05
-"""The p-value at or below which generated and observed values count as different."""
-NAMED = 5
-"""Trajectories of one kind of wrong diagnosis that are named, at most."""
-POOR = 0.5
-"""The recall below which a class counts as not recognised."""
-
 
 def card(study: Study) -> Section:
     """Of the headline's updated twin, else of the first source."""
@@ -49,10 +42,11 @@ def card(study: Study) -> Section:
 def unlike(study: Study, source: str) -> list[tuple[str, FidelityFigure]]:
     """The components of z whose generated and observed values differ, with their KS distance."""
     fidelity = study.results.fidelity.get(source)
+    # The p-value at or below which generated and observed values count as different.
     return [
         (latent_names(name)[0], figure)
         for name, figure in (fidelity.agreement if fidelity else {}).items()
-        if figure.p is not None and figure.p <= SIGNIFICANT
+        if figure.p is not None and figure.p <= 0.05
     ]
 
 
@@ -127,8 +121,15 @@ def _confused(study: Study, source: str) -> list[tuple[str, str, Cell]]:
     ]
 
 
-def _missed(study: Study, source: str) -> list[tuple[str, float]]:
-    """The classes with a poor recall over all runs."""
+def _missed(study: Study, source: str, *, poor: float = 0.5) -> list[tuple[str, float]]:
+    """The classes with a poor recall over all runs.
+
+    Parameters
+    ----------
+    poor : float, default 0.5
+        The recall below which a class counts as not recognised.
+
+    """
     counts = study.results.sources[source].confusion
     if counts is None or source not in study.diagnosing:
         return []
@@ -136,18 +137,25 @@ def _missed(study: Study, source: str) -> list[tuple[str, float]]:
     return [
         (class_name(name), recall)
         for name, row, recall in zip(study.results.classes, counts, recalls, strict=True)
-        if sum(row) and recall < POOR
+        if sum(row) and recall < poor
     ]
 
 
-def _trajectories(study: Study, names: Sequence[str]) -> Cell:
-    """Their ids, as links to the explorer where it shows them; of many the number of the rest."""
+def _trajectories(study: Study, names: Sequence[str], *, named: int = 5) -> Cell:
+    """Their ids, as links to the explorer where it shows them; of many the number of the rest.
+
+    Parameters
+    ----------
+    named : int, default 5
+        Trajectories of one kind of wrong diagnosis that are named, at most.
+
+    """
     ids = study.results.data.test.ids
     shown = {ids[place] for place in study.results.overlaid} if study.explorable else set()
     links = [
-        Link(n, f"trajectory={quote(n, safe='')}" if n in shown else "") for n in names[:NAMED]
+        Link(n, f"trajectory={quote(n, safe='')}" if n in shown else "") for n in names[:named]
     ]
-    more = len(names) - NAMED
+    more = len(names) - named
     return Cell("", links=[*links, *([Link(f"and {more} more", "")] if more > 0 else [])])
 
 

@@ -13,19 +13,24 @@ from retwin.report.labels import number, places, shown_unit, signed
 from retwin.report.study import Study
 
 SOURCE = "dynamics"
-WIDTH = 1.6449
-"""Standard deviations of a central 90 % interval."""
 
 
-def delta(study: Study) -> Section | None:
-    """The difference of the corrected state equations from those of the twin as given."""
+def delta(study: Study, *, width: float = 1.6449) -> Section | None:
+    """The difference of the corrected state equations from those of the twin as given.
+
+    Parameters
+    ----------
+    width : float, default 1.6449
+        Standard deviations of a central 90 % interval.
+
+    """
     arrays = study.arrays
     if "delta/values" not in arrays:
         return None
     colour, panels = colour_of(SOURCE), []
     for i, (equation, variable, unit, slope) in enumerate(arrays["delta/about"].tolist()):
         x, y = (arrays[f"delta/{name}"][i].astype(float) for name in ("values", "discrepancy"))
-        half = WIDTH * arrays["delta/deviation"][i]
+        half = width * arrays["delta/deviation"][i]
         low, high = arrays["delta/range"][i].tolist()
         marks: list[Mark] = [
             Spans([(float(x[0]), low), (high, float(x[-1]))]),

@@ -16,8 +16,6 @@ from retwin.report.labels import class_name, quantities, source_name
 from retwin.report.study import Study
 from retwin.results import OverlayInfo
 
-MISSING = 65535
-"""The code of a number that is not defined."""
 FINE, COARSE, POSE = 16000, 4000, 1500
 """Steps from the smallest to the largest number: of signals, bands, and poses."""
 
@@ -137,7 +135,8 @@ def packed(values: NDArray, axis: int = -1, steps: int = FINE) -> dict[str, Any]
     low = float(known.min()) if known.size else 0.0
     step = (float(known.max()) - low) / steps if known.size else 0.0
     codes = np.zeros(values.shape) if step == 0 else (values - low) / step
-    whole = np.where(np.isfinite(values), np.round(codes), MISSING).astype(np.uint16)
+    # The code of a number that is not defined.
+    whole = np.where(np.isfinite(values), np.round(codes), 65535).astype(np.uint16)
     first = np.zeros_like(whole.take([0], axis=axis)) if whole.shape[axis] else whole
     change = np.diff(whole, axis=axis, prepend=first).astype("<u2")
     planes = np.ascontiguousarray(change).view(np.uint8).reshape(-1, 2).T

@@ -33,8 +33,6 @@ OUTPUTS = 3
 """Outputs of which figures are drawn, at most."""
 COMMANDS = 3
 """Commands of which figures are drawn, at most."""
-BLOCKS = 40
-"""Blocks of the error over time."""
 
 
 def residuals(study: Study) -> Section | None:
@@ -192,9 +190,16 @@ def _amplitudes(errors: Errors, of: ChannelRecords) -> Panel | None:
     return Panel(Axis(of.name, of.unit), rows, alt, f"{name} by {of.name}", height=320)
 
 
-def _over_time(errors: Errors, outside: NDArray, rate: float) -> Panel:
-    """The error over time, and where a channel of any record is outside (T,)."""
-    found = {key: rms_over_time(e, BLOCKS) for key, e in errors.by_key.items()}
+def _over_time(errors: Errors, outside: NDArray, rate: float, *, blocks: int = 40) -> Panel:
+    """The error over time, and where a channel of any record is outside (T,).
+
+    Parameters
+    ----------
+    blocks : int, default 40
+        Blocks of the error over time.
+
+    """
+    found = {key: rms_over_time(e, blocks) for key, e in errors.by_key.items()}
     edges = next(iter(found.values()))[0] / rate
     marks: list[Mark] = [Spans(list(_runs(outside, edges, rate)))] if outside.any() else []
     for key, (_, rms) in found.items():

@@ -10,12 +10,16 @@ from retwin.report.figures.style import colour_of, dash
 from retwin.report.labels import quantity, source_name
 from retwin.report.study import Study
 
-SHOWN = 2
-"""Records that the figure shows, at most."""
 
+def simulation(study: Study, *, shown: int = 2) -> Section | None:
+    """Every output of the first records: measured and simulated above, the errors below.
 
-def simulation(study: Study) -> Section | None:
-    """Every output of the first records: measured and simulated above, the errors below."""
+    Parameters
+    ----------
+    shown : int, default 2
+        Records that the figure shows, at most.
+
+    """
     sources = _selected(study)
     measured = study.arrays.get("simulation/observed")
     if not sources or measured is None:
@@ -28,7 +32,7 @@ def simulation(study: Study) -> Section | None:
         keys.append(Key(text, colour_of(sources[-1]), "bar"))
     panels = [
         _panel(study, sources, record, output)
-        for record in range(min(SHOWN, len(measured)))
+        for record in range(min(shown, len(measured)))
         for output in range(measured.shape[2])
     ]
     figure = Figure("simulation", panels, keys, columns=1)

@@ -25,39 +25,32 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.equations.state_twin import StateTwin
-from retwin.update.blackbox.estimate import (
-    BlackBox,
-    BlackBoxFit,
-    best_order,
-    check_records,
-    cross_validated,
-    estimation_of,
-    followed,
-    states_within,
-)
+from retwin.update.blackbox import estimate
 from retwin.update.blackbox.lags import Lags, least_squares
 from retwin.update.dynamics.estimation import Point
 from retwin.update.dynamics.unknowns import coefficients_of
 
-MAX_ORDER = 8
-"""Largest number of past samples that is tried."""
-START = 10.0
-"""Bound of the states at the first sample, over their largest value at rest."""
 
-
-def fit_arx(observed: Trajectories, seed: int, progress: Progress | None) -> BlackBox:
+def fit_arx(observed: Trajectories, seed: int, progress: Progress | None) -> estimate.BlackBox:
     """The linear model of the order that predicts held-out blocks best; it needs no seed."""
     linear, fit = best_linear(observed, progress)
     return fit.model(linear.lags.order, len(observed.outputs))
 
 
 def best_linear(
-    observed: Trajectories, progress: Progress | None = None
-) -> tuple[Linear, BlackBoxFit]:
-    """The linear model of the best order, and its fit."""
-    check_records(observed)
-    orders = range(1, MAX_ORDER + 1)
-    order, fit = best_order(orders, lambda n: Linear(Lags(observed, n, 1)).fit(), progress)
+    observed: Trajectories, progress: Progress | None = None, *, max_order: int = 8
+) -> tuple[Linear, estimate.BlackBoxFit]:
+    """The linear model of the best order, and its fit.
+
+    Parameters
+    ----------
+    max_order : int, default 8
+        Largest number of past samples that is tried.
+
+    """
+    estimate.check_records(observed)
+    orders = range(1, max_order + 1)
+    order, fit = estimate.best_order(orders, lambda n: Linear(Lags(observed, n, 1)).fit(), progress)
     return Linear(Lags(observed, order, 1)), fit
 
 
@@ -114,11 +107,12 @@ class Linear:
             return tuple(following)
 
         starts = self.starts(theta)
-        bound = START * (1.0 + float(np.abs(starts).max()))
+        # Bound of the states at the first sample, over their largest value at rest.
+        bound = 10.0 * (1.0 + float(np.abs(starts).max()))
         terms = [each.name for each in self.lags.terms]
         names = [f"{own}: {term}" for own in observed.outputs.names for term in terms]
         channels = observed.inputs, observed.outputs, observed.rate
-        states, parameters = states_within(starts, bound), coefficients_of(names, theta)
+        states, parameters = estimate.states_within(starts, bound), coefficients_of(names, theta)
         return StateTwin(states, output, *channels, step=step, parameters=parameters)
 
     def starts(self, theta: NDArray) -> NDArray:
@@ -133,13 +127,17 @@ class Linear:
             found.insert(0, later)
         return np.concatenate(found, axis=1)
 
-    def fit(self) -> BlackBoxFit | None:
+    def fit(self) -> estimate.BlackBoxFit | None:
         """The model; None where samples are too few or a simulation diverges."""
-        return cross_validated(self.lags.observed.mask, self.without) if self.lags.enough else None
+        return (
+            estimate.cross_validated(self.lags.observed.mask, self.without)
+            if self.lags.enough
+            else None
+        )
 
-    def without(self, part: NDArray) -> BlackBoxFit | None:
+    def without(self, part: NDArray) -> estimate.BlackBoxFit | None:
         """The model without a part (n, T) of the samples; None where its simulation diverges."""
         kept = self.lags.rows.without(part)
         theta = np.stack([least_squares(kept.values, y) for y in kept.outputs.T])
-        estimation = estimation_of(self.twin(theta), self.lags.observed, part)
-        return followed(estimation, Point(theta.ravel(), self.starts(theta)))
+        estimation = estimate.estimation_of(self.twin(theta), self.lags.observed, part)
+        return estimate.followed(estimation, Point(theta.ravel(), self.starts(theta)))

@@ -27,28 +27,8 @@ from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 from retwin.update.forecast_errors import value_range
 
-FOLDS = 10
-"""Parts of the calibration record, each made of blocks of all trajectories, that are held out."""
-MAX_REFITTED_SAMPLES = 100_000
-"""Samples that are fitted again and again, without each part in turn; of longer records fewer
-parts are held out."""
-WORTH = 0.99
-"""Ratio of held-out errors below which a larger order is better."""
 PATIENCE = 2
 """Orders, or strengths of a prior, that are tried beyond the best one."""
-STRONGEST = 1000.0
-"""Variance of the error of an effective sample that is assumed first, over that of the model where
-it begins: a prior so strong that nonlinear terms begin near 0."""
-STEP = 10.0
-"""Ratio of that variance to the next one."""
-MAX_STRENGTHS = 8
-"""Number of variances at most."""
-SEARCH = 25
-"""Steps of the search with each variance at most."""
-MAX_PASSES = 6
-"""Times that the error of the outputs is estimated anew."""
-SAME = 0.1
-"""Logarithm of the ratio of two variances below which they agree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +85,17 @@ class BlackBoxFit:
     def _tested(self) -> Estimation:
         return replace(self.estimation, seen=~np.isnan(self.errors))
 
-    def searched(self, variance: NDArray) -> BlackBoxFit:
-        """The most probable point nearby with another variance of the errors."""
+    def searched(self, variance: NDArray, *, max_steps: int = 25) -> BlackBoxFit:
+        """The most probable point nearby with another variance of the errors.
+
+        Parameters
+        ----------
+        max_steps : int, default 25
+            Steps of the search with each variance at most.
+
+        """
         estimation = replace(self.estimation, variance=variance)
-        found = estimation.minimised(estimation.linearised(self.point), SEARCH)
+        found = estimation.minimised(estimation.linearised(self.point), max_steps)
         return replace(self, estimation=estimation, point=found.point)
 
     def model(self, order: int, corrected: int) -> BlackBox:
@@ -146,13 +133,11 @@ def check_records(observed: Trajectories) -> None:
     checked_stride(observed, observed, None, "observed")  # type: ignore[arg-type]  # its channels
     low, high = value_range(np.where(observed.mask, observed.observed, np.nan))
     fixed = [name for name, same in zip(observed.outputs.names, low == high, strict=True) if same]
-    require(
-        not fixed and len(observed.inputs) > 0,
-        "observed",
-        expected="commands, and outputs that are measured and that change",
-        got=f"outputs that do not: {', '.join(fixed)}" if fixed else "no commands",
-        remedy="leave such outputs out, and record the commands",
-    )
+    driven = not fixed and len(observed.inputs) > 0
+    expected = "commands, and outputs that are measured and that change"
+    got = f"outputs that do not: {', '.join(fixed)}" if fixed else "no commands"
+    remedy = "leave such outputs out, and record the commands"
+    require(driven, "observed", expected=expected, got=got, remedy=remedy)
 
 
 def best_order(
@@ -170,7 +155,8 @@ def best_order(
     for done, order in enumerate(orders, 1):
         found = fit(order)
         error = np.inf if found is None else found.held_out
-        if found is not None and error < (WORTH * best[1].held_out if best else np.inf):
+        # Ratio of held-out errors below which a larger order is better.
+        if found is not None and error < (0.99 * best[1].held_out if best else np.inf):
             best = order, found
         if progress is not None:
             progress(0.9 * done / len(orders))
@@ -183,16 +169,24 @@ def best_order(
     return given("observed", best, expected, got=got, remedy=remedy)
 
 
-def held_out_parts(seen: NDArray) -> list[NDArray]:
+def held_out_parts(seen: NDArray, *, folds: int = 10) -> list[NDArray]:
     """The parts (n, T) of a record that are held out in turn.
 
     Each trajectory is cut into blocks, of which a part has one, another one in each. The first
     block is in no part, since without it hardly anything determines the states at the start.
+
+    Parameters
+    ----------
+    folds : int, default 10
+        Parts of the calibration record, each made of blocks of all trajectories, that are held out.
+
     """
     trajectories, samples, _ = seen.shape
-    block = np.arange(samples) * (FOLDS + 1) // samples
-    own = (block - 1 + np.arange(trajectories)[:, None]) % FOLDS
-    count = int(np.clip(MAX_REFITTED_SAMPLES // max(1, seen.sum()), 1, FOLDS))
+    block = np.arange(samples) * (folds + 1) // samples
+    own = (block - 1 + np.arange(trajectories)[:, None]) % folds
+    # Samples that are fitted again and again, without each part in turn; of longer records fewer
+    # parts are held out.
+    count = int(np.clip(100_000 // max(1, seen.sum()), 1, folds))
     return [(own == part) & (block > 0) for part in range(count)]
 
 
@@ -265,9 +259,12 @@ def with_best_prior(start: Callable[[NDArray], BlackBoxFit], seen: NDArray) -> B
     whole, fits = start(np.zeros(seen.shape[:2], dtype=bool)), [start(part) for part in parts]
     if not all(each.estimation.linearised(each.point).finite for each in fits):
         return None
-    variance = STRONGEST * observed_variance(fits[0].estimation, fits[0].point)
+    # Variance of the error of an effective sample that is assumed first, over that of the model
+    # where it begins: a prior so strong that nonlinear terms begin near 0.
+    variance = 1000.0 * observed_variance(fits[0].estimation, fits[0].point)
     best, least, since = fits[0], np.inf, 0
-    for _ in range(MAX_STRENGTHS):
+    # Number of variances at most.
+    for _ in range(8):
         fits = [each.searched(variance) for each in fits]
         found = replace(whole, errors=held_out_errors(fits, parts, seen))
         since += 1
@@ -275,7 +272,8 @@ def with_best_prior(start: Callable[[NDArray], BlackBoxFit], seen: NDArray) -> B
             whole, best, least, since = found, fits[0], found.held_out, 0
         if since == PATIENCE:
             break
-        variance = variance / STEP
+        # Ratio of that variance to the next one.
+        variance = variance / 10.0
     whole = replace(whole, point=best.point).searched(best.estimation.variance)
     observed = observed_variance(whole.estimation, whole.point)
     return replace(whole, estimation=replace(whole.estimation, variance=observed))
@@ -287,13 +285,21 @@ def observed_variance(estimation: Estimation, point: Point) -> NDArray:
     return estimation.power(residual) * correlation_time(residual)
 
 
-def followed(estimation: Estimation, point: Point) -> BlackBoxFit | None:
-    """The fit whose assumed errors are those that are observed; None where the start diverges."""
+def followed(estimation: Estimation, point: Point, *, max_passes: int = 6) -> BlackBoxFit | None:
+    """The fit whose assumed errors are those that are observed; None where the start diverges.
+
+    Parameters
+    ----------
+    max_passes : int, default 6
+        Times that the error of the outputs is estimated anew.
+
+    """
     if not np.isfinite(estimation.residual(point)).all():
         return None
-    for _ in range(MAX_PASSES):
+    for _ in range(max_passes):
         variance = observed_variance(estimation, point)
-        settled = np.all(np.abs(np.log(variance / estimation.variance)) < SAME)
+        # Logarithm of the ratio of two variances below which they agree.
+        settled = np.all(np.abs(np.log(variance / estimation.variance)) < 0.1)
         estimation = replace(estimation, variance=variance)
         if settled:
             break

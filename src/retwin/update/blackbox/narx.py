@@ -23,48 +23,28 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.equations.state import State
 from retwin.twins.equations.state_twin import StateTwin
-from retwin.update.blackbox.estimate import (
-    BlackBox,
-    BlackBoxFit,
-    best_order,
-    check_records,
-    estimation_of,
-    with_best_prior,
-)
+from retwin.update.blackbox import estimate
 from retwin.update.blackbox.lags import ROWS_PER_TERM, Lags, least_squares
 from retwin.update.dynamics.estimation import Estimation, Point
 from retwin.update.dynamics.unknowns import coefficients_of
 
-DEGREE = 3
-"""Highest degree of the monomials; it is lowered for many variables, see `Library`."""
-MAX_ORDER = 4
-"""Largest number of past samples that is tried."""
 WIDER = 4.0
 """Bound of outputs, in half widths of their range in calibration about its centre: a simulation
 that diverges is held there, and the model warns that it leaves the range."""
-MARGIN = 1.0
-"""How far samples before the first one may lie beyond the range of a channel, in widths of it."""
-MAX_TERMS = 40
-"""Largest number of terms of an output that is tried."""
-SIGNIFICANT = 12.0
-"""What a term explains at least, over the variance of the error that is left: the largest of some
-hundred terms explains as much of white noise with a probability of 5 %."""
-MAX_ROWS = 20_000
-"""Number of samples at which terms are ordered."""
-DISTINCT = 1e-5
-"""Norm of what a term of norm 1 has beyond the chosen ones, below which it is a combination."""
 
 
-def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> BlackBox:
+def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> estimate.BlackBox:
     """The polynomial model of past outputs and commands; it needs no seed.
 
     Forward regression adds nonlinear terms to the linear ones, by the share of the variance that
     each explains beyond those before it. They have a Gaussian prior about 0.
     """
-    check_records(observed)
-    orders = range(1, MAX_ORDER + 1)
-    order, found = best_order(
-        orders, lambda n: Polynomial(Lags(observed, n, DEGREE)).fit(), progress
+    estimate.check_records(observed)
+    # Largest number of past samples that is tried.
+    orders = range(1, 5)
+    # Highest degree of the monomials; it is lowered for many variables, see `Library`.
+    order, found = estimate.best_order(
+        orders, lambda n: Polynomial(Lags(observed, n, 3)).fit(), progress
     )
     return found.model(order, len(observed.outputs))
 
@@ -116,29 +96,30 @@ class Polynomial:
         channels = (lags.observed.outputs, lags.observed.inputs)
         units = [unit for each in channels for _ in range(lags.order) for unit in each.units]
         low, high = (each[: len(units)] for each in (lags.domain.low, lags.domain.high))
-        margin = MARGIN * np.where(high > low, high - low, 1.0)
+        # Samples before the first one may lie by its width beyond the range of a channel.
+        margin = np.where(high > low, high - low, 1.0)
         columns = (self.starts.mean(axis=0), low - margin, high + margin)
         numbers = (each.tolist() for each in columns)
         return [State(*each) for each in zip(lags.names, units, *numbers, strict=True)]
 
-    def fit(self) -> BlackBoxFit | None:
+    def fit(self) -> estimate.BlackBoxFit | None:
         """The model; None where samples are too few or the linear model diverges."""
         if not self.lags.enough:
             return None
         observed, chosen, linear = self.lags.observed, self.chosen(), self.linear
 
-        def start(part: NDArray) -> BlackBoxFit:
+        def start(part: NDArray) -> estimate.BlackBoxFit:
             kept = self.lags.rows.without(part)
             coefficients = np.zeros((len(chosen), max(map(len, chosen))))
             columns = kept.values[:, linear]
             coefficients[:, linear] = [least_squares(columns, y) for y in kept.outputs.T]
             pairs = zip(coefficients, chosen, strict=True)
             flat = np.concatenate([own[: len(terms)] for own, terms in pairs])
-            estimation = estimation_of(self.twin(chosen, flat), observed, part)
+            estimation = estimate.estimation_of(self.twin(chosen, flat), observed, part)
             estimation = self._with_prior(estimation, chosen)
-            return BlackBoxFit(estimation, Point(flat, self.starts), np.empty(0))
+            return estimate.BlackBoxFit(estimation, Point(flat, self.starts), np.empty(0))
 
-        return with_best_prior(start, observed.mask)
+        return estimate.with_best_prior(start, observed.mask)
 
     @property
     def linear(self) -> list[int]:
@@ -162,11 +143,20 @@ class Polynomial:
         )
         return replace(estimation, unknowns=unknowns)
 
-    def chosen(self) -> list[list[int]]:
-        """The terms of each output, in the order of forward regression after the linear ones."""
+    def chosen(self, *, max_terms: int = 40, max_rows: int = 20_000) -> list[list[int]]:
+        """The terms of each output, in the order of forward regression after the linear ones.
+
+        Parameters
+        ----------
+        max_terms : int, default 40
+            Largest number of terms of an output that is tried.
+        max_rows : int, default 20_000
+            Number of samples at which terms are ordered.
+
+        """
         rows = self.lags.rows
-        some = np.linspace(0, len(rows) - 1, min(len(rows), MAX_ROWS)).astype(int)
-        most = min(MAX_TERMS, len(rows) // ROWS_PER_TERM)
+        some = np.linspace(0, len(rows) - 1, min(len(rows), max_rows)).astype(int)
+        most = min(max_terms, len(rows) // ROWS_PER_TERM)
         return [forward(rows.values[some], y, most, self.linear) for y in rows.outputs[some].T]
 
 
@@ -198,9 +188,12 @@ def forward(columns: NDArray, target: NDArray, count: int, first: list[int]) -> 
     while len(chosen) < min(count, columns.shape[1]):
         size = np.linalg.norm(rest, axis=0)
         size[chosen] = 0.0
-        gain = np.divide(rest.T @ left, size, out=np.zeros(len(size)), where=size > DISTINCT)
+        # Norm of what a term of norm 1 has beyond the chosen ones, below which it is a combination.
+        gain = np.divide(rest.T @ left, size, out=np.zeros(len(size)), where=size > 1e-5)
         best = int(np.argmax(np.abs(gain)))
-        if gain[best] ** 2 <= SIGNIFICANT * (left @ left) / len(left):
+        # What a term explains at least, over the variance of the error that is left: the largest of
+        # some hundred terms explains as much of white noise with a probability of 5 %.
+        if gain[best] ** 2 <= 12.0 * (left @ left) / len(left):
             break
         direction = rest[:, best] / size[best]
         left -= direction * (direction @ left)

@@ -36,12 +36,8 @@ from retwin.update.blackbox.lags import Lags
 from retwin.update.dynamics.estimation import Point
 from retwin.update.state_surrogate.equations import ChannelScale, Equations
 
-SAMPLES_PER_WEIGHT = 10
-"""Measured samples per number of the network at least."""
 WIDTHS = (2, 16)
 """Least and largest width of the hidden layer."""
-START = 3.0
-"""Bound of the states at the first sample, over their largest value in the linear model."""
 
 
 def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) -> BlackBox:
@@ -59,7 +55,8 @@ def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) 
         if found is None:
             return None
         equations, starts = begin_with(own, found, np.random.default_rng(seed))
-        states = states_within(starts, START * max(1.0, float(np.abs(starts).max())))
+        # Bound of the states at the first sample, over their largest value in the linear model.
+        states = states_within(starts, 3.0 * max(1.0, float(np.abs(starts).max())))
         twin = equations.trainable(observed, states)
 
         def start(part: NDArray) -> BlackBoxFit:
@@ -77,7 +74,7 @@ def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) 
 
 
 def begin_with(
-    linear: Linear, fit: BlackBoxFit, rng: np.random.Generator
+    linear: Linear, fit: BlackBoxFit, rng: np.random.Generator, *, samples_per_weight: int = 10
 ) -> tuple[Equations, NDArray]:
     """A linear model in coordinates in which its states are white, beside a random network.
 
@@ -89,6 +86,8 @@ def begin_with(
         Its coefficients, which `Linear.without` found.
     rng : Generator
         Of the weights of the network, which have no effect yet.
+    samples_per_weight : int, default 10
+        Measured samples per number of the network at least.
 
     Returns
     -------
@@ -114,7 +113,7 @@ def begin_with(
     white = (states - middle) @ whiten.T
     speed = np.sqrt(np.mean(np.diff(white, axis=1) ** 2, axis=(0, 1)))
     samples = int(fit.estimation.seen.sum())
-    hidden = samples // (SAMPLES_PER_WEIGHT * (2 * size + inputs + 1))
+    hidden = samples // (samples_per_weight * (2 * size + inputs + 1))
     hidden = int(np.clip(hidden, *WIDTHS))
     arrays = {
         "A": whiten @ a @ back,

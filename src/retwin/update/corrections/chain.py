@@ -19,8 +19,8 @@ from retwin.update.corrections.correction import (
     Head,
     block_diagonal,
 )
+from retwin.update.corrections.delays import gather_samples
 from retwin.update.corrections.sampled_sensor import SampledSensor
-from retwin.update.corrections.warp import gather_samples
 
 
 @dataclass(frozen=True)
@@ -49,21 +49,16 @@ class Chain:
     second: Correction | SampledSensor
 
     def __post_init__(self) -> None:
-        require(
-            not isinstance(self.first, SampledSensor) and sensor_of(self.first) is None,
-            "first",
-            expected="an operator that acts on the system, the sensor being last",
-            got=type(self.first).__name__,
-            remedy="give the sensor as the second",
-        )
+        acts = not isinstance(self.first, SampledSensor) and sensor_of(self.first) is None
+        expected = "an operator that acts on the system, the sensor being last"
+        got = type(self.first).__name__
+        require(acts, "first", expected=expected, got=got, remedy="give the sensor as the second")
         if not isinstance(self.second, SampledSensor):
-            require(
-                self.first.resolution == self.second.resolution,
-                "second",
-                expected=f"an operator with one z per {self.first.resolution}, as the first has",
-                got=f"{type(self.second).__name__}, one per {self.second.resolution}",
-                remedy="chain operators of the same resolution",
-            )
+            alike = self.first.resolution == self.second.resolution
+            expected = f"an operator with one z per {self.first.resolution}, as the first has"
+            got = f"{type(self.second).__name__}, one per {self.second.resolution}"
+            remedy = "chain operators of the same resolution"
+            require(alike, "second", expected=expected, got=got, remedy=remedy)
 
     @property
     def resolution(self) -> str:

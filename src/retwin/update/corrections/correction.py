@@ -16,9 +16,6 @@ from retwin.data.trajectories import Channels
 from retwin.inference.problem import Rows
 from retwin.update.corrections.commands.machines import Learned, OtherMachines
 
-CONSTANT = 1e-6
-"""Standard deviation of a constant output, relative to its size: the rounding of numbers."""
-
 
 class DifferentiableTwin(Protocol):
     """The part of a surrogate that corrections use: a call with gradient, and one without.
@@ -162,7 +159,8 @@ def _scale(surrogate: DifferentiableTwin, nominal: Tensor) -> Tensor | None:
     if hasattr(surrogate, "unit") or not isinstance(outputs, Channels):
         return None
     values = nominal.double().flatten(0, 1)
-    tiny = CONSTANT * values.abs().amax(dim=0)
+    # Standard deviation of a constant output, relative to its size: the rounding of numbers.
+    tiny = 1e-6 * values.abs().amax(dim=0)
     spread = values.std(dim=0, correction=0)
     spread = torch.where(spread > tiny, spread, 1.0)
     if outputs.comparable:

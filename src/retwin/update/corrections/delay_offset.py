@@ -15,34 +15,21 @@ from torch import Tensor
 
 from retwin.checks import positive
 from retwin.data.trajectories import Channels
-from retwin.inference.losses import StudentT
-from retwin.inference.noise import Noise
-from retwin.inference.priors import GaussianPrior
+from retwin.inference.noise import Noise, StudentT
+from retwin.inference.problem import GaussianPrior
 from retwin.inference.solver import Solution, blocks, solve
 from retwin.update.corrections.commands.path_problem import PathProblem, path_at
 from retwin.update.corrections.correction import Context, Discrepancy, Head
 from retwin.update.corrections.delay_range import checked_range, range_in_samples, range_in_seconds
-from retwin.update.corrections.delays import at_bound, first_delays
-from retwin.update.corrections.warp import within
+from retwin.update.corrections.delays import at_bound, first_delays, within
 from retwin.update.kernels.generation import delayed_path
 
-ROUNDS = 5
-"""Times that the noise is estimated anew, and z with it."""
-TRAJECTORIES_PER_BATCH = 128
-"""Trajectories inferred together, which bounds memory."""
 WIDE = 100.0
 """Standard deviation of the prior, in the largest plausible value: it decides only what was not
 measured at all."""
-UNSEEN = 0.1
-"""Share of the prior's standard deviation above which an offset was not measured."""
 KNOWN_DELAY = 1 / 8
 """Standard deviation above which a delay is not identified by default, in widths of its range: less
 than half of that of a delay of which nothing is known."""
-SIGNIFICANT = 3.0
-"""Way of a motion, in standard deviations of the step between its offsets, below which noise could
-have made it: its delay is then not identified."""
-MEASURED_MOTION = 0.5
-"""Share of a motion that must be measured for its delay to be identified."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +101,10 @@ class DelayOffset:
         `Context.unit`, and of a sample the outputs that were measured count.
         """
         limits = range_in_samples(self.delay_range, context, observed, mask)
+        # Trajectories inferred together, which bounds memory.
         parts = [
             self._infer(context[some], observed[some], mask[some], limits)
-            for some in torch.arange(len(context)).split(TRAJECTORIES_PER_BATCH)
+            for some in torch.arange(len(context)).split(128)
         ]
         names = ("z", "covariance", "identified", "noise", "at_bound")
         columns: dict[str, Any] = {
@@ -143,7 +131,8 @@ class DelayOffset:
         # A fast motion half a sample beside the grid is beyond the cutoff of Tukey's loss, and the
         # rounding of the few samples that count would decide where its delay goes from there.
         noise = replace(noise, loss=StudentT())
-        for _ in range(ROUNDS):
+        # Times that the noise is estimated anew, and z with it.
+        for _ in range(5):
             solution = solve(problem, prior, noise, x, bounds=problem.bounds, reweightings=1)
             x = solution.x
             noise, prior = _learned(problem, problem.residual(x))
@@ -177,8 +166,20 @@ def _discrepancy(
     prior: GaussianPrior,
     unit: Tensor,
     known_delay: float,
+    *,
+    unseen: float = 0.1,
+    measured_motion: float = 0.5,
 ) -> Discrepancy:
-    """z, each segment's covariance, and which components the outputs identify."""
+    """z, each segment's covariance, and which components the outputs identify.
+
+    Parameters
+    ----------
+    unseen : float, default 0.1
+        Share of the prior's standard deviation above which an offset was not measured.
+    measured_motion : float, default 0.5
+        Share of a motion that must be measured for its delay to be identified.
+
+    """
     z = problem.per_segment(solution.x)
     covariance = blocks(solution.covariance, z.shape[1])
     deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
@@ -186,8 +187,8 @@ def _discrepancy(
     valid = torch.as_tensor(problem.segments.valid)
     bounded = at_bound(z[..., 0], problem.delay_range) & valid
     delay = (deviation[..., 0] <= known_delay) & _moves(problem, z, deviation) & ~bounded
-    delay &= problem.motion_measured >= MEASURED_MOTION
-    offset = deviation[..., 1:] <= UNSEEN * wide[..., 1:]
+    delay &= problem.motion_measured >= measured_motion
+    offset = deviation[..., 1:] <= unseen * wide[..., 1:]
     identified = torch.cat([delay[..., None], offset], dim=-1)
     identified = identified & valid[..., None]
     scale = torch.cat([unit.new_ones(1), unit])
@@ -207,4 +208,6 @@ def _moves(problem: PathProblem, z: Tensor, deviation: Tensor) -> Tensor:
     inside = within(problem.sample, start + z[..., 0], settle + z[..., 0] + 1)
     variance = deviation[..., 1:].square()
     before = torch.cat([torch.zeros_like(variance[:, :1]), variance[:, :-1]], dim=1)
-    return (inside.to(way) @ way > SIGNIFICANT * (variance + before).sqrt()).any(dim=-1)
+    # Way of a motion, in standard deviations of the step between its offsets, below which noise
+    # could have made it: its delay is then not identified.
+    return (inside.to(way) @ way > 3.0 * (variance + before).sqrt()).any(dim=-1)

@@ -16,11 +16,8 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.update.corrections.commands.path_problem import PathProblem
 from retwin.update.corrections.correction import Context
-from retwin.update.corrections.delays import common_delay, first_delays
-from retwin.update.corrections.warp import within
+from retwin.update.corrections.delays import common_delay, first_delays, within
 
-FEW = 0.05
-"""Share of delays at a bound that needs no mention: a few segments are always missed."""
 ROUNDING = 1e-6
 """Difference in samples that is only the rounding of numbers."""
 MAX_TRAJECTORIES = 20
@@ -29,10 +26,6 @@ EARLIEST, LATEST = -0.5, 1.0
 """Limits of the wide grid, in median lengths of a segment."""
 QUANTILES = (0.05, 0.95)
 """Quantiles of the delays of single segments: a few missed segments do not count."""
-STILL = 0.25
-"""Share of the median way of a segment's motion below which its delay hardly shows."""
-SHORTEST = 0.1
-"""Smallest margin beyond the delays that are found, in median durations of a motion."""
 
 
 def checked_range(delay_range: tuple[float, float] | None) -> None:
@@ -56,13 +49,10 @@ def range_in_samples(
     if delay_range is None:
         return plausible_delays(context, observed, mask)
     duration = context.segments.steps / context.rate
-    require(
-        np.abs(delay_range).max() <= duration,
-        "delay_range",
-        expected=f"delays in seconds, shorter than the trajectories of {duration:.3g} s",
-        got=delay_range,
-        remedy="divide samples by the sample rate, or leave it out to choose it from the outputs",
-    )
+    shorter = np.abs(delay_range).max() <= duration
+    expected = f"delays in seconds, shorter than the trajectories of {duration:.3g} s"
+    remedy = "divide samples by the sample rate, or leave it out to choose it from the outputs"
+    require(shorter, "delay_range", expected=expected, got=delay_range, remedy=remedy)
     # 0.3 s times 100 Hz is a little more than 30 samples.
     low, high = (each * context.rate for each in delay_range)
     return float(math.floor(low + ROUNDING)), float(math.ceil(high - ROUNDING))
@@ -76,9 +66,16 @@ def range_in_seconds(
     return low / context.rate, high / context.rate
 
 
-def bound_note(share: float) -> str:
-    """What is wrong with a range that this share of the delays ends at; "" where nothing is."""
-    if share <= FEW:
+def bound_note(share: float, *, few: float = 0.05) -> str:
+    """What is wrong with a range that this share of the delays ends at; "" where nothing is.
+
+    Parameters
+    ----------
+    few : float, default 0.05
+        Share of delays at a bound that needs no mention: a few segments are always missed.
+
+    """
+    if share <= few:
         return ""
     return f"{share:.0%} of the delays are at a bound of delay_range, give a wider one"
 
@@ -112,7 +109,8 @@ def plausible_delays(context: Context, observed: Tensor, mask: Tensor) -> tuple[
     x = x.flatten(1)
     common = common_delay(problem, x, limits)
     moves = _moves(problem, x)
-    least = max(math.ceil(SHORTEST * motion), 2)
+    # Smallest margin beyond the delays that are found, in median durations of a motion.
+    least = max(math.ceil(0.1 * motion), 2)
     half = max(abs(common), least)
     while True:
         near = common - half, common + half
@@ -126,10 +124,16 @@ def plausible_delays(context: Context, observed: Tensor, mask: Tensor) -> tuple[
     return float(low), float(high)
 
 
-def _moves(problem: PathProblem, x: Tensor) -> Tensor:
+def _moves(problem: PathProblem, x: Tensor, *, still: float = 0.25) -> Tensor:
     """Whether the outputs move enough in a segment, and are measured, to show its delay (n, M).
 
     An offset in x (n, P) undoes a part of the way: all of it where actuators missed a segment.
+
+    Parameters
+    ----------
+    still : float, default 0.25
+        Share of the median way of a segment's motion below which its delay hardly shows.
+
     """
     way = problem.path.diff(dim=1, prepend=problem.path[:, :1]).norm(dim=-1)
     inside = within(problem.sample, problem.segments.start, problem.segments.settle + 1)
@@ -137,7 +141,7 @@ def _moves(problem: PathProblem, x: Tensor) -> Tensor:
     valid = torch.as_tensor(problem.segments.valid) & (problem.motion_measured > 0)
     offset = problem.per_segment(x)[..., 1:]
     undone = offset.diff(dim=1, prepend=torch.zeros_like(offset[:, :1])).norm(dim=-1)
-    enough = STILL * ways[valid].median()
+    enough = still * ways[valid].median()
     for moves in (valid & (ways - undone > enough), valid & (ways > enough)):
         if moves.any():
             return moves

@@ -18,8 +18,6 @@ from torch import Tensor
 from retwin.inference.noise import Noise
 from retwin.update.corrections.commands.problem import CommandProblem
 
-HYPERPRIOR_SEGMENTS = 2.0
-"""Segments that the hyperprior of an actuator's variance counts as much as."""
 SMALLEST = 1e-6
 """Smallest share of the residual's power that a variance explains: it keeps covariances from being
 singular."""
@@ -86,7 +84,8 @@ class SampleNoise:
         # Few segments may show no change of a rounded position at all: the variances of actuators
         # are expected to be about the same share of what their commands vary.
         usual = (alone[1:] / spread).log()
-        believed = HYPERPRIOR_SEGMENTS / max(1.0, float(problem.valid.sum()))
+        # Segments that the hyperprior of an actuator's variance counts as much as.
+        believed = 2.0 / max(1.0, float(problem.valid.sum()))
 
         def objective(logarithm: NDArray) -> tuple[float, NDArray]:
             variance = alone * torch.as_tensor(logarithm).exp()

@@ -17,20 +17,9 @@ from torch import Tensor, nn
 
 from retwin.checks import given, require
 from retwin.data.segments import Segments
-from retwin.update.corrections.warp import gather_samples
+from retwin.update.corrections.delays import gather_samples
 from retwin.update.kernels.generation import joined_samples
 
-LONGEST_PERIOD = 1000
-"""Longest sampling period that is searched for, in time steps of the record: it bounds the time
-that the search takes. Other limits are shares of the record."""
-MIN_VALUES = 20
-"""Fewest sampled values of a record from which their period is estimated."""
-PLAIN = 0.2
-"""Largest bend at the next most bent phase, relative to that at the sampling phase."""
-ROUNDING = 1e-6
-"""Difference from a whole number of time steps that is only the rounding of numbers."""
-SMOOTH = 1e-6
-"""Largest bend, in standard deviations of an output, that is only the rounding of numbers."""
 REGULAR, GROSS = 0.9, 30.0
 """A value is a glitch if its error is `GROSS` times this quantile of all errors."""
 LEVELS = np.linspace(0, 1, 33)
@@ -83,14 +72,10 @@ class SampledSensor:
             and 0 <= (self.glitch_probability or 0.0) <= 1
             and all(len(q) > 1 and sorted(q) == list(q) for q in self.noise or ())
         )
-        require(
-            sound,
-            "sensor",
-            expected="a period in seconds above 0, phases from 0 to below it, finite sizes of "
-            "at least 0, rising quantiles and a probability from 0 to 1",
-            got=repr(self),
-            remedy="leave out what you do not know: it is fitted from data",
-        )
+        expected = "a period in seconds above 0, phases from 0 to below it, finite sizes of "
+        expected += "at least 0, rising quantiles and a probability from 0 to 1"
+        remedy = "leave out what you do not know: it is fitted from data"
+        require(sound, "sensor", expected=expected, got=repr(self), remedy=remedy)
 
     def timing(self, rate: float) -> tuple[int, tuple[int, ...] | None]:
         """Sampling period and phases in time steps at `rate` in Hz, where a period is given.
@@ -104,13 +89,11 @@ class SampledSensor:
         expected, remedy = "one whose timing is known", "call timed or fitted first"
         period = given("sensor", self.period, expected, got=repr(self), remedy=remedy)
         every = round(period * rate)
-        require(
-            every >= 1 and abs(period * rate - every) <= ROUNDING,
-            "sensor.period",
-            expected=f"a whole number of time steps of {1 / rate:g} s",
-            got=f"{period:g} s",
-            remedy="leave it out: it is fitted from data",
-        )
+        # Difference from a whole number of time steps that is only the rounding of numbers.
+        whole = every >= 1 and abs(period * rate - every) <= 1e-6
+        expected = f"a whole number of time steps of {1 / rate:g} s"
+        remedy = "leave it out: it is fitted from data"
+        require(whole, "sensor.period", expected=expected, got=f"{period:g} s", remedy=remedy)
         if self.phases is None:
             return every, None
         return every, tuple(round(phase * rate) % every for phase in self.phases)
@@ -233,11 +216,20 @@ class SampledSensor:
         return hit * size.new_tensor(self.glitch_size or 0.0) * size
 
 
-def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:
-    """Sampling period and phases: the longest period with plain kinks."""
+def _timing(observed: Tensor, mask: Tensor, *, min_values: int = 20) -> tuple[int, tuple[int, ...]]:
+    """Sampling period and phases: the longest period with plain kinks.
+
+    Parameters
+    ----------
+    min_values : int, default 20
+        Fewest sampled values of a record from which their period is estimated.
+
+    """
     measured = int(mask.any(dim=-1).any(dim=0).sum())
     bends = _bends(observed, mask)
-    for every in range(min(LONGEST_PERIOD, measured // MIN_VALUES), 1, -1):
+    # Longest sampling period that is searched for, in time steps of the record: it bounds the time
+    # that the search takes. Other limits are shares of the record.
+    for every in range(min(1000, measured // min_values), 1, -1):
         kinks = _kinks(bends, every)
         plain = _plain(kinks)
         if 2 * plain.sum() > (kinks.amax(dim=1) > 0).sum():
@@ -267,10 +259,19 @@ def _kinks(bends: Tensor, every: int) -> Tensor:
     return whole.unflatten(1, (-1, every)).nanmean(dim=1).nan_to_num(0.0)
 
 
-def _plain(kinks: Tensor) -> Tensor:
-    """Whether a record (n,) bends at one phase and hardly at others."""
+def _plain(kinks: Tensor, *, plain: float = 0.2, smooth: float = 1e-6) -> Tensor:
+    """Whether a record (n,) bends at one phase and hardly at others.
+
+    Parameters
+    ----------
+    plain : float, default 0.2
+        Largest bend at the next most bent phase, relative to that at the sampling phase.
+    smooth : float, default 1e-6
+        Largest bend, in standard deviations of an output, that is only the rounding of numbers.
+
+    """
     largest, second = kinks.topk(2, dim=1).values.unbind(dim=1)
-    return (largest > SMOOTH) & (second < PLAIN * largest)
+    return (largest > smooth) & (second < plain * largest)
 
 
 def _phases(kinks: Tensor) -> Tensor:

@@ -14,10 +14,6 @@ from numpy.typing import NDArray
 
 __all__ = ["Arrow", "bounded_step"]
 
-SINGULAR = 1e-12
-"""Share of the largest curvature that is added to all, since some directions may have none."""
-MAX_DAMPINGS = 50
-"""Newton steps at most to the damping of a step; a few suffice."""
 RIM = 1.1
 """Longest step over the radius of its trust region."""
 
@@ -125,8 +121,10 @@ def trust_region_step(curvature: Arrow, gradient: NDArray, radius: float) -> NDA
         Length of the longest step, up to 10 %.
 
     """
-    damping = SINGULAR * float(curvature.diagonal.max())
-    for _ in range(MAX_DAMPINGS):
+    # Share of the largest curvature that is added to all, since some directions may have none.
+    damping = 1e-12 * float(curvature.diagonal.max())
+    # Newton steps at most to the damping of a step; a few suffice.
+    for _ in range(50):
         damped = curvature.plus(np.full(len(gradient), damping))
         step = -damped.solve(gradient)
         length = float(np.linalg.norm(step))

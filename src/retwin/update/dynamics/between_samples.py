@@ -34,9 +34,6 @@ from retwin.update.dynamics.unknowns import Unknowns
 
 __all__ = ["chosen"]
 
-EVIDENT = 2.0
-"""Number of standard errors by which the errors under held commands must be in the direction of
-another interpolation before that is tried."""
 Found = tuple[Estimation, Linearised, Candidate]
 
 
@@ -118,7 +115,9 @@ def _is_shown(candidate: Candidate, other: str, parts: Sequence[NDArray]) -> boo
     if size.sum() <= 0:
         return False
     share = along.sum() / size.sum()
-    return bool(share > EVIDENT * np.sqrt(np.sum((along - share * size) ** 2)) / size.sum())
+    # Number of standard errors by which the errors under held commands must be in the direction of
+    # another interpolation before that is tried.
+    return bool(share > 2.0 * np.sqrt(np.sum((along - share * size) ** 2)) / size.sum())
 
 
 def _subtract_explained(candidate: Candidate, effect: NDArray) -> NDArray:

@@ -25,27 +25,12 @@ from retwin.update.dynamics.unknowns import Unknowns
 
 __all__ = ["Candidate", "best_of", "better", "searched", "without_discrepancy"]
 
-STRONGEST = 100.0
-"""Variance of the error of an effective sample that is assumed first, over that of the samples of
-the twin without discrepancy: a prior so strong that the discrepancy begins near 0."""
 STEP = (2.0, 3.0)
 """Least and largest ratio of that variance to the next one: larger steps leave the optimum that the
 search follows."""
-CONSISTENT = 0.9
-"""Ratio of the observed to the assumed variance from which they agree."""
-DECIDED = 2.0
-"""Number of standard errors by which a memory, or commands that are not held between samples, must
-lower the logarithms of held-out errors."""
-HELD = 1e-3
-"""Standard deviation of what the outputs of the twin alone do not determine, in those of the
-parameters if each were the only one: a discrepancy would determine it by its prior alone."""
 OPEN, MAX_OPEN = 2, 100
 """Degree of the monomials of all states and commands in each equation, and number of coefficients
 above which they are not tried."""
-MAX_STRENGTHS = 30
-"""Number of variances at most."""
-ERROR_STEPS = 2
-"""Times that the error of each output is estimated anew where the twin alone is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,20 +73,24 @@ class Candidate:
 
 
 def without_discrepancy(
-    base: StateTwin, observed: Trajectories, unknowns: Unknowns
+    base: StateTwin, observed: Trajectories, unknowns: Unknowns, *, error_steps: int = 2
 ) -> tuple[Estimation, Linearised]:
-    """The fit of the twin itself, and what it leaves open: held there by `absorbed`."""
+    """The fit of the twin itself, and what it leaves open: held there by `absorbed`.
+
+    Parameters
+    ----------
+    error_steps : int, default 2
+        Times that the error of each output is estimated anew where the twin alone is fitted.
+
+    """
     starts = np.tile(unknowns.start[unknowns.free], (len(observed), 1))
     estimation = Estimation(base, observed, unknowns, observed.mask, np.ones(len(base.outputs)))
     found = estimation.linearised(Point(unknowns.mean, starts))
-    require(
-        found.finite,
-        "twin",
-        expected="a simulation of the commands that is finite",
-        got="one that is not, at the present parameters",
-        remedy="identify the twin first, or choose other starts of its parameters",
-    )
-    for _ in range(ERROR_STEPS):
+    expected = "a simulation of the commands that is finite"
+    got = "one that is not, at the present parameters"
+    remedy = "identify the twin first, or choose other starts of its parameters"
+    require(found.finite, "twin", expected=expected, got=got, remedy=remedy)
+    for _ in range(error_steps):
         estimation = replace(estimation, variance=estimation.power(found.residual))
         found = estimation.minimised(_with_best_delays(estimation, found))
     return hold_confounded(
@@ -111,7 +100,9 @@ def without_discrepancy(
 
 def hold_confounded(estimation: Estimation, found: Linearised) -> Estimation:
     """The same with combinations of shared coordinates held of which the samples say nothing."""
-    combinations, there = estimation.confounded(found) / HELD, found.point.shared
+    # Standard deviation of what the outputs of the twin alone do not determine, in those of the
+    # parameters if each were the only one: a discrepancy would determine it by its prior alone.
+    combinations, there = estimation.confounded(found) / 1e-3, found.point.shared
 
     def held(shared: NDArray) -> tuple[NDArray, NDArray]:
         return combinations @ (shared - there), combinations
@@ -150,6 +141,7 @@ def searched(
     progress: Progress,
     *,
     only: Candidate | None = None,
+    strongest: float = 100.0,
 ) -> list[Candidate]:
     """All candidates, the simplest first.
 
@@ -169,13 +161,16 @@ def searched(
         Called with the share of the work that is done.
     only : Candidate, optional
         The one whose form alone is tried, with and without a memory.
+    strongest : float, default 100.0
+        Variance of the error of an effective sample that is assumed first, over that of the samples
+        of the twin without discrepancy: a prior so strong that the discrepancy begins near 0.
 
     """
     tried: list[Candidate] = []
     for number, equations in enumerate(_forms(alone, point, settings, visited)):
         if only is not None and not equations.alike(only.equations):
             continue
-        own, found = _follow(equations, None, alone, point, STRONGEST)
+        own, found = _follow(equations, None, alone, point, strongest)
         tried.append(Candidate.tested(equations, None, own, found, parts, far))
         if settings.remembers(equations.form):
             slow = _memory(equations, alone, own, found)
@@ -196,17 +191,24 @@ def best_of(tried: Sequence[Candidate]) -> Candidate:
     return best if better(best, other) else other
 
 
-def better(candidate: Candidate, other: Candidate) -> bool:
+def better(candidate: Candidate, other: Candidate, *, decided: float = 2.0) -> bool:
     """Whether a candidate has lower held-out errors in nearly all parts.
 
     It is asked for what can imitate other errors: a memory is a state more, and with a short time
     constant much like a parameter; and an equation may depend on all variables by chance.
+
+    Parameters
+    ----------
+    decided : float, default 2.0
+        Number of standard errors by which a memory, or commands that are not held between samples,
+        must lower the logarithms of held-out errors.
+
     """
     before, after = (np.log(np.concatenate(each.squares)) for each in (other, candidate))
     change = (after - before)[np.isfinite(after - before)]
     if len(change) < 2:
         return False
-    return bool(np.mean(change) < -DECIDED * np.std(change, ddof=1) / np.sqrt(len(change)))
+    return bool(np.mean(change) < -decided * np.std(change, ddof=1) / np.sqrt(len(change)))
 
 
 def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin:
@@ -310,6 +312,9 @@ def _follow(
     alone: Estimation,
     point: Point,
     strength: float,
+    *,
+    consistent: float = 0.9,
+    max_strengths: int = 30,
 ) -> tuple[Estimation, Linearised]:
     """The fit whose assumed errors are those that are observed.
 
@@ -326,6 +331,10 @@ def _follow(
         Where the search begins; coefficients that it does not have are at their starts.
     strength : float
         The first assumed variance, over that of `alone`.
+    consistent : float, default 0.9
+        Ratio of the observed to the assumed variance from which they agree.
+    max_strengths : int, default 30
+        Number of variances at most.
 
     """
     estimation = _with_discrepancy(equations, [memory] if memory else [], alone)
@@ -333,7 +342,7 @@ def _follow(
     begun = np.append(point.shared, estimation.unknowns.mean[len(point.shared) :])
     now = estimation.linearised(Point(begun, point.starts))
     states = len(equations.twin.states)
-    for _ in range(MAX_STRENGTHS):
+    for _ in range(max_strengths):
         estimation = replace(estimation, variance=strength * power)
         now = estimation.minimised(now)
         # What a network has in common with parameters is that over the states that it leads to.
@@ -343,7 +352,7 @@ def _follow(
         estimation = replace(estimation, absorbed=absorbed)
         ratio = np.mean(estimation.power(now.residual) / power)
         observed = correlation_time(now.residual) * float(ratio)
-        if observed >= CONSISTENT * strength:
+        if observed >= consistent * strength:
             break
         strength = float(np.clip(observed, strength / STEP[1], strength / STEP[0]))
     # The last step may have led below what is observed.

@@ -32,8 +32,6 @@ __all__ = ["Estimation", "correlation_time", "estimate_starts", "root"]
 
 MAX_STEPS = 60
 """Steps of the trust-region method at most."""
-TOLERANCE = 1e-2
-"""Norm of the gradient, in nats per prior or posterior deviation, at which the search ends."""
 IDLE = (5, 0.03)
 """Number of successive steps, each of which gains less than so many nats, at which the search ends:
 of inner coefficients of terms that hardly matter next to nothing is known."""
@@ -41,13 +39,6 @@ WIDEST = 1e6
 """Largest trust region, in posterior deviations at the start of the search."""
 RESOLUTION = 1e-12
 """Smallest variance that counts, over that of an output: about that of single precision."""
-WINDOW = 5
-"""Lags over which the autocorrelation is summed, in correlation times."""
-ACCEPTED = 0.15
-"""Ratio of the decrease of the objective to that of its quadratic approximation, from which a step
-is made."""
-ROUNDS = 3
-"""Estimates of the starts of a record, of which each takes the errors of the one before."""
 CHUNK = 2**20
 """Number of derivatives that are computed at once, unless one trajectory has more: 8 MB."""
 
@@ -189,7 +180,9 @@ class Estimation:
         unit = curvature.unit
         radius, idle = WIDEST / 1e3, 0
         for _ in range(steps):
-            if np.linalg.norm(unit * gradient) < TOLERANCE or idle == IDLE[0]:
+            # Norm of the gradient, in nats per prior or posterior deviation, at which the search
+            # ends.
+            if np.linalg.norm(unit * gradient) < 1e-2 or idle == IDLE[0]:
                 break
             scaled = curvature.scaled(unit)
             ends = ((each - flat) / unit for each in self.bounds)
@@ -206,7 +199,9 @@ class Estimation:
                 radius = length / 4
             elif ratio > 0.75:
                 radius = max(radius, min(2 * length, WIDEST))
-            if ratio > ACCEPTED:
+            # Ratio of the decrease of the objective to that of its quadratic approximation, from
+            # which a step is made.
+            if ratio > 0.15:
                 idle = idle + 1 if value - found[0] < IDLE[1] else 0
                 at, flat, (value, gradient, curvature) = tried, inside, found
                 # What did not act at the start may act now, and its unit was without meaning.
@@ -275,9 +270,7 @@ class Estimation:
             slope = self.absorbed(at.point.shared)[1]
             shared = shared + slope.T @ slope
         arrow = Arrow(
-            shared,
-            own[..., :parameters] @ unknowns.matrix,
-            own[..., parameters + unknowns.free],
+            shared, own[..., :parameters] @ unknowns.matrix, own[..., parameters + unknowns.free]
         )
         return arrow.plus(self._prior[1])
 
@@ -356,12 +349,18 @@ def root(covariance: NDArray) -> NDArray:
     return directions * np.sqrt(np.maximum(values, 0.0))
 
 
-def correlation_time(residual: NDArray) -> float:
+def correlation_time(residual: NDArray, *, correlation_times: int = 5) -> float:
     """Samples per effective one: the integrated autocorrelation time of residuals (n, T, d_y).
 
     Unlike that of a first-order autoregression, it holds for residuals that oscillate. The sum over
     lags ends at five times its own value (Sokal, "Monte Carlo methods in statistical
     mechanics", in Functional Integration, 1997).
+
+    Parameters
+    ----------
+    correlation_times : int, default 5
+        Lags over which the autocorrelation is summed, in correlation times.
+
     """
     samples = residual.shape[1]
     scale = np.sqrt(np.mean(residual**2, axis=(0, 1)))
@@ -371,7 +370,7 @@ def correlation_time(residual: NDArray) -> float:
     if covariance[0] <= 0:
         return 1.0
     times = 2 * np.cumsum(covariance / covariance[0]) - 1
-    window = np.arange(samples) >= WINDOW * times
+    window = np.arange(samples) >= correlation_times * times
     return float(max(1.0, times[np.argmax(window)] if window.any() else times[-1]))
 
 
@@ -397,25 +396,22 @@ def estimate_starts(
         Not one trajectory, nothing measured, no unknown start, or a simulation that diverges.
 
     """
-    require(
-        len(record) == 1 and record.mask.any() and len(unknowns.free) > 0,
-        "record",
-        expected="one trajectory with measured samples, for a twin with unknown starts",
-        got=f"{len(record)} with {int(record.mask.sum())} samples, {len(unknowns.free)} starts",
-        remedy="give the first samples of one record; bounds make a start unknown",
-    )
+    fits = len(record) == 1 and record.mask.any() and len(unknowns.free) > 0
+    expected = "one trajectory with measured samples, for a twin with unknown starts"
+    got = f"{len(record)} with {int(record.mask.sum())} samples, {len(unknowns.free)} starts"
+    remedy = "give the first samples of one record; bounds make a start unknown"
+    require(fits, "record", expected=expected, got=got, remedy=remedy)
     given = np.ones(len(record.outputs)) if variance is None else variance
     own = Estimation(twin, record, unknowns, record.mask, given)
     found = own.linearised(Point(np.zeros(0), unknowns.start[None, unknowns.free]))
-    require(
-        bool(np.isfinite(found.products).all()),
-        "record",
-        expected="commands with which the simulation of the equations stays finite",
-        got=f"{record.ids[0]}, with which it diverges",
-        remedy="it leaves what the equations were corrected for: fit them to records like this "
-        "one, or take the twin with identified parameters alone",
-    )
-    for i in range(1 if variance is not None else ROUNDS):
+    finite = bool(np.isfinite(found.products).all())
+    expected = "commands with which the simulation of the equations stays finite"
+    got = f"{record.ids[0]}, with which it diverges"
+    remedy = "it leaves what the equations were corrected for: fit them to records like this "
+    remedy += "one, or take the twin with identified parameters alone"
+    require(finite, "record", expected=expected, got=got, remedy=remedy)
+    # Estimates of the starts of a record, of which each takes the errors of the one before.
+    for i in range(1 if variance is not None else 3):
         if variance is None:
             own = replace(own, variance=own.power(found.residual) if i else own.spread)
         found = own.minimised(found)

@@ -41,9 +41,6 @@ from retwin.workers.threads import one_thread
 
 __all__ = ["FittedDynamics", "assembled", "fit_dynamics"]
 
-NONLINEAR = 1.5
-"""Ratio of the errors of a simulation to those of a linear step, from which on the step is none."""
-
 
 @dataclass(frozen=True, eq=False)
 class FittedDynamics:
@@ -223,20 +220,14 @@ def _check_samples(observed: Trajectories, parameters: int) -> None:
     """Refuse an output that was never measured, and fewer samples than parameters."""
     names = observed.outputs.names
     missing = [name for i, name in enumerate(names) if not observed.mask[..., i].any()]
-    require(
-        not missing,
-        "observed",
-        expected="measured samples of every output",
-        got=f"none of {', '.join(missing)}",
-        remedy="leave that output out of the twin and of the record, since its noise is unknown",
-    )
-    require(
-        observed.mask.sum() > parameters,
-        "observed",
-        expected="more measured samples than parameters",
-        got=int(observed.mask.sum()),
-        remedy="give more or longer trajectories, or free fewer parameters",
-    )
+    expected = "measured samples of every output"
+    got = f"none of {', '.join(missing)}"
+    remedy = "leave that output out of the twin and of the record, since its noise is unknown"
+    require(not missing, "observed", expected=expected, got=got, remedy=remedy)
+    expected = "more measured samples than parameters"
+    got = str(observed.mask.sum())
+    remedy = "give more or longer trajectories, or free fewer parameters"
+    require(observed.mask.sum() > parameters, "observed", expected=expected, got=got, remedy=remedy)
 
 
 def assembled(
@@ -308,7 +299,9 @@ def _trusted(
             continue
         residual = estimation.residual(Point(found.shared + move, found.starts))[part]
         linear = held_out.errors[part]
-        if np.sum(residual**2) <= NONLINEAR**2 * np.sum(linear**2):
+        # Ratio of the errors of a simulation to those of a linear step, from which on the step is
+        # none.
+        if np.sum(residual**2) <= 1.5**2 * np.sum(linear**2):
             moves[k] = move
     return moves
 

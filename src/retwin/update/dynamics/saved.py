@@ -82,24 +82,18 @@ def _check(equations: StateTwin, arrays: Mapping[str, NDArray], domain: Domain) 
     shapes = [arrays[name].shape for name in ARRAYS]
     both = parameters + states
     wanted = [(both,), (both, shapes[1][-1]), *[(states,)] * 4, *[(len(traced.outputs),)] * 3]
-    require(
-        shapes == wanted and all(np.isfinite(each).all() for each in arrays.values()),
-        "weights",
-        expected=f"finite arrays of the shapes {wanted}",
-        got=shapes,
-        remedy="save the model again",
-    )
+    fits = shapes == wanted and all(np.isfinite(each).all() for each in arrays.values())
+    expected = f"finite arrays of the shapes {wanted}"
+    require(fits, "weights", expected=expected, got=shapes, remedy="save the model again")
     ends = np.stack([domain.low, domain.mean, domain.high])
-    require(
+    sound = (
         all((arrays[name] >= 0).all() for name in ARRAYS[2:])
         and (arrays["noise"] > 0).all()
         and ends.shape == (3, states + len(equations.inputs))
         and domain.speed.shape == (states,)
         and np.isfinite(ends).all()
         and np.isfinite(domain.speed).all()
-        and (np.diff(ends, axis=0) >= 0).all(),
-        "weights",
-        expected="variances above 0 and a domain of all states and commands",
-        got="others",
-        remedy="save the model again",
+        and (np.diff(ends, axis=0) >= 0).all()
     )
+    expected = "variances above 0 and a domain of all states and commands"
+    require(sound, "weights", expected=expected, got="others", remedy="save the model again")

@@ -65,45 +65,34 @@ class Dynamics:
         for name, kind in (("library", Library), ("network", TanhNetwork)):
             if getattr(self, name) is not None:
                 instance(name, getattr(self, name), kind, remedy=f"give {kind.__name__}(...)")
-        require(
-            self.library is not None or self.network is not None,
-            "library",
-            expected="a library, a network, or both",
-            got="neither",
-            remedy="give Library(...) or network=TanhNetwork(...)",
-        )
+        stated = self.library is not None or self.network is not None
+        expected = "a library, a network, or both"
+        remedy = "give Library(...) or network=TanhNetwork(...)"
+        require(stated, "library", expected=expected, got="neither", remedy=remedy)
         for name in ("states", "passive"):
             given = getattr(self, name)
-            require(
-                not isinstance(given, str) and len(set(given)) == len(given),
-                name,
-                expected="different names of states",
-                got=repr(given),
-                remedy="give each once, in a tuple",
-            )
+            distinct = not isinstance(given, str) and len(set(given)) == len(given)
+            expected = "different names of states"
+            got = repr(given)
+            require(distinct, name, expected=expected, got=got, remedy="give each once, in a tuple")
             object.__setattr__(self, name, tuple(given))
         whole("folds", self.folds, at_least=2)
         one_of("memory", self.memory, (True, False))
         one_of("held", self.held, (True, False))
         for state, variables in self.depends.items():
-            require(
-                not isinstance(variables, str) and len(variables) > 0,
-                "depends",
-                expected="names of variables for each state",
-                got=f"{variables!r} for {state}",
-                remedy='give them in a tuple, such as {"velocity": ("velocity",)}',
-            )
+            listed = not isinstance(variables, str) and len(variables) > 0
+            expected = "names of variables for each state"
+            got = f"{variables!r} for {state}"
+            remedy = 'give them in a tuple, such as {"velocity": ("velocity",)}'
+            require(listed, "depends", expected=expected, got=got, remedy=remedy)
         for state, signs in self.monotone.items():
             for sign in signs.values():
                 one_of("monotone", sign, (1, -1))
             both = state in self.passive and set(signs) - {state}
-            require(
-                not both and not (state in self.passive and signs.get(state) == 1),
-                "monotone",
-                expected=f"nothing for {state}, which is passive: non-increasing in {state} alone",
-                got=", ".join(signs),
-                remedy="name it in one of monotone and passive",
-            )
+            consistent = not both and not (state in self.passive and signs.get(state) == 1)
+            expected = f"nothing for {state}, which is passive: non-increasing in {state} alone"
+            remedy = "name it in one of monotone and passive"
+            require(consistent, "monotone", expected=expected, got=", ".join(signs), remedy=remedy)
 
     @property
     def forms(self) -> Iterator[Library | TanhNetwork]:

@@ -237,13 +237,10 @@ class DynamicsTwin(TwinWrapper):
         made = Prediction(record, *self.filter(*given)).marginal(self.filter.slopes(*given))
         parts = (made.mean, made.covariance, made.states)
         good = np.all([np.isfinite(each).reshape(len(record), -1).all(1) for each in parts], 0)
-        require(
-            good.all(),
-            "record",
-            expected="commands and outputs with which the filter stays finite",
-            got=f"trajectories {np.flatnonzero(~good)[:5].tolist()} with which it does not",
-            remedy="leave them out, or give more substeps",
-        )
+        expected = "commands and outputs with which the filter stays finite"
+        got = f"trajectories {np.flatnonzero(~good)[:5].tolist()} with which it does not"
+        remedy = "leave them out, or give more substeps"
+        require(good.all(), "record", expected=expected, got=got, remedy=remedy)
         self._warn(self.domain.excess(made.states, record.commands))
         return made
 

@@ -98,14 +98,11 @@ def state_twin_of(
     """The state twin, its free parameters, and the present values of all its parameters."""
     parametric = twin.parametric() if isinstance(twin, StateTwin) and twin.free else twin
     base = parametric.twin if isinstance(parametric, ParametricTwin) else parametric
-    require(
-        isinstance(base, StateTwin),
-        "twin",
-        expected="a StateTwin, or a ParametricTwin of one",
-        got=type(base).__name__,
-        remedy="write the state equations as a StateTwin, or learn them from simulations by "
-        "fit_state_surrogate; other twins have output corrections",
-    )
+    expected = "a StateTwin, or a ParametricTwin of one"
+    got = type(base).__name__
+    remedy = "write the state equations as a StateTwin, or learn them from simulations by "
+    remedy += "fit_state_surrogate; other twins have output corrections"
+    require(isinstance(base, StateTwin), "twin", expected=expected, got=got, remedy=remedy)
     assert isinstance(base, StateTwin)
     values = dict(zip(base.names, base.values(None, 1)[0].tolist(), strict=True))
     if not isinstance(parametric, ParametricTwin):

@@ -27,13 +27,6 @@ from retwin.update.dynamics.estimation import Estimation
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
 
-RESOLUTION = 1e-3
-"""Error of a sample, over the standard deviation of its output, to a hundredth of which the starts
-are found."""
-DEPENDENT = 1e-10
-"""Singular value, over the largest one of a window, below which a combination of its starts has no
-effect."""
-
 
 @dataclass(frozen=True, eq=False)
 class Windows:
@@ -97,7 +90,9 @@ class Windows:
             rate=self.observed.rate,
         )
         spread = (spread_of(cut) / self.unit).max(initial=0.0)
-        variance = (RESOLUTION * (spread or 1.0) * self.unit) ** 2
+        # Error of a sample, over the standard deviation of its output, to a hundredth of which the
+        # starts are found.
+        variance = (1e-3 * (spread or 1.0) * self.unit) ** 2
         base = state_twin_of(self.twin)[0]
         return Estimation(base, cut, self._unknowns(self.twin), own, variance)
 
@@ -164,8 +159,16 @@ class Windows:
         """Outputs (n, T, d_y) at parameters (k,): NaN where a simulation fails, 0 in no window."""
         return self._join(self._at(tuple(theta.tolist()))[1])
 
-    def derivatives(self, theta: NDArray) -> NDArray:
-        """Derivatives (n, T, d_y, k) of the outputs by the parameters, where the starts follow."""
+    def derivatives(self, theta: NDArray, *, dependent: float = 1e-10) -> NDArray:
+        """Derivatives (n, T, d_y, k) of the outputs by the parameters, where the starts follow.
+
+        Parameters
+        ----------
+        dependent : float, default 1e-10
+            Singular value, over the largest one of a window, below which a combination of its
+            starts has no effect.
+
+        """
         slopes, own = self._at(tuple(theta.tolist()))[2], self._estimation
         parameters = len(own.twin.parameters)
         mixed = slopes[..., :parameters] @ self.twin.mixing[:parameters]
@@ -174,7 +177,7 @@ class Windows:
             return self._join(np.full_like(mixed, np.nan))
         weight = own.seen[..., None] / self.unit[:, None]
         flat = [(weight * e).reshape(len(e), -1, e.shape[-1]) for e in (by_start, mixed)]
-        follow = np.linalg.pinv(flat[0], DEPENDENT) @ flat[1]
+        follow = np.linalg.pinv(flat[0], dependent) @ flat[1]
         return self._join(mixed - by_start @ follow[:, None])
 
     def _join(self, windows: NDArray) -> NDArray:

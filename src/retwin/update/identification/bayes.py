@@ -14,11 +14,8 @@ from retwin.update.identification.mcmc import MCMC
 from retwin.update.identification.misfit import Misfit, misfit_of
 from retwin.update.identification.npe import NPE
 from retwin.update.identification.posterior import Posterior, PosteriorTwin
-from retwin.update.identification.problem import BoxProblem
-from retwin.update.identification.summaries import Summaries, outlyingness
+from retwin.update.identification.problem import BoxProblem, Summaries, outlyingness
 
-MAX_DRAWS = 4000
-"""Largest number of draws of the posterior that are kept."""
 SIGNIFICANCE = 0.02
 """Prior predictive p-value of the measured data below which the twin counts as misspecified."""
 
@@ -34,7 +31,8 @@ def infer_posterior(misfit: Misfit, method: MCMC | NPE, progress: Progress | Non
     problem = BoxProblem(misfit, method.noise, for_prior)
     points, figures, warning = method.sample(problem, seed=for_method, progress=progress)
     p_value = _prior_predictive(problem, np.random.default_rng(for_check))
-    order = np.random.default_rng(for_kept).permutation(len(points))[:MAX_DRAWS]
+    # Largest number of draws of the posterior that are kept.
+    order = np.random.default_rng(for_kept).permutation(len(points))[:4000]
     samples, logs = problem.physical(points[order])
     twin, mean = misfit.twin, samples.mean(axis=0)
     figures["rms_after"] = misfit.rms_of(misfit.residuals(mean[None]))

@@ -15,19 +15,9 @@ from retwin.twins.collected import SimulationError
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.update.dynamics.windows import sampled, spread_of, state_based, windows_of
 
-FOLDS = 4
-"""Parts of the record that are left out in turn."""
 LONGEST, RATIO = 10, 3
 """The longest window is the record by the first number; each other one is the one before by the
 second. So a part that is left out contains two of the longest."""
-SHORTEST = 20
-"""Samples of the shortest window."""
-LASTING = 0.5
-"""Effect of a start or an early command on the outputs at the end of a record, over its largest
-effect, from which a plant counts as integrating or unstable. That of a stable plant decays."""
-OVERFITTED = 2.0
-"""Ratio of the errors of parts of a record that were left out to those of the fit, from which on
-the parameters of whole records count as overfitted."""
 
 Fit = Callable[[Trajectories, int | None], ParametricTwin]
 """Fits a twin to measurements, in windows of so many samples or None for whole records."""
@@ -54,12 +44,20 @@ class Candidate:
     deviation: float
 
 
-def lasting(twin: ParametricTwin, observed: Trajectories) -> bool:
+def lasting(twin: ParametricTwin, observed: Trajectories, *, lasting: float = 0.5) -> bool:
     """Whether the effect of a start, or of early commands, lasts until the end of a record.
 
     It does in an integrating, an unstable or a very slow plant; so do the effects of disturbances.
     The record is the longest one. Where the states of a twin cannot be set, commands are held for a
     while; not the first one, on which the start may depend.
+
+    Parameters
+    ----------
+    lasting : float, default 0.5
+        Effect of a start or an early command on the outputs at the end of a record, over its
+        largest effect, from which a plant counts as integrating or unstable. That of a stable plant
+        decays.
+
     """
     row = int(np.argmax(observed.lengths))
     last = int(observed.lengths[row])
@@ -82,13 +80,20 @@ def lasting(twin: ParametricTwin, observed: Trajectories) -> bool:
         return True
     size = np.abs(effect).max(axis=1)
     at_end = size[-max(1, last // LONGEST) :].max(axis=0)
-    return bool((at_end > LASTING * size.max(axis=0)).any())
+    return bool((at_end > lasting * size.max(axis=0)).any())
 
 
-def lengths_of(observed: Trajectories) -> list[int]:
-    """The lengths of windows that are tried, in samples, the longest first."""
+def lengths_of(observed: Trajectories, *, shortest: int = 20) -> list[int]:
+    """The lengths of windows that are tried, in samples, the longest first.
+
+    Parameters
+    ----------
+    shortest : int, default 20
+        Samples of the shortest window.
+
+    """
     length, made = int(observed.lengths.max()) // LONGEST, []
-    while length >= SHORTEST:
+    while length >= shortest:
         made.append(length)
         length //= RATIO
     return made
@@ -176,7 +181,9 @@ def overfitted(held: HeldOut, residual: NDArray, without: Sequence[ParametricTwi
     )
     alone, inside = np.exp(2 * held.errors(without, ())[:, 0]), np.exp(2 * fitted)
     known = np.isfinite(alone) & np.isfinite(inside)
-    return bool(alone[known].sum() > OVERFITTED**2 * inside[known].sum())
+    # Ratio of the errors of parts of a record that were left out to those of the fit, from which on
+    # the parameters of whole records count as overfitted.
+    return bool(alone[known].sum() > 2.0**2 * inside[known].sum())
 
 
 def choose_length(held: HeldOut, whole: Sequence[ParametricTwin | None] | None) -> list[Candidate]:
@@ -225,17 +232,24 @@ def _rank(lengths: Sequence[int | None], logs: NDArray) -> list[Candidate]:
     return [made[i] for i in order]
 
 
-def _parts(observed: Trajectories) -> Iterator[NDArray]:
-    """Parts (n, T) of the samples: trajectories where there are enough, else blocks of time."""
+def _parts(observed: Trajectories, *, folds: int = 4) -> Iterator[NDArray]:
+    """Parts (n, T) of the samples: trajectories where there are enough, else blocks of time.
+
+    Parameters
+    ----------
+    folds : int, default 4
+        Parts of the record that are left out in turn.
+
+    """
     shape = observed.mask.shape[:2]
-    if len(observed) >= FOLDS:
-        place = np.broadcast_to(np.arange(len(observed))[:, None] % FOLDS, shape)
+    if len(observed) >= folds:
+        place = np.broadcast_to(np.arange(len(observed))[:, None] % folds, shape)
     else:
         # By the last sample that was measured: what follows may be held out.
         seen = np.any(observed.mask, axis=2)
         length = observed.steps - np.argmax(seen[:, ::-1], axis=1)[:, None]
-        place = np.minimum(np.arange(shape[1])[None] * FOLDS // length, FOLDS - 1)
-    for k in range(FOLDS):
+        place = np.minimum(np.arange(shape[1])[None] * folds // length, folds - 1)
+    for k in range(folds):
         yield place == k
 
 

@@ -15,8 +15,6 @@ CHI2_95 = 3.84
 """95 % quantile of the chi-square distribution with one degree of freedom."""
 UNIFORM = 12**-0.5
 """Standard deviation of a uniform distribution between the bounds, in widths of the bounds."""
-AGREEMENT = 0.05
-"""Distance of equally good optima, in widths of the bounds, up to which they agree in any case."""
 NEGLIGIBLE = 0.01
 """Component of an undetermined direction, below which it does not concern a parameter: along the
 whole range of the others, that parameter changes by less than this share of its own range."""
@@ -108,6 +106,7 @@ def identifiability(
     width: NDArray,
     at_bound: NDArray,
     alternatives: NDArray,
+    agreement: float = 0.05,
 ) -> Identifiability:
     """The identifiability at an optimum.
 
@@ -127,6 +126,9 @@ def identifiability(
         (k,) bool.
     alternatives : NDArray
         (r, k), optima from other starts that fit as well, minus the best one, in widths.
+    agreement : float, default 0.05
+        Distance of equally good optima, in widths of the bounds, up to which they agree in any
+        case.
 
     Returns
     -------
@@ -159,7 +161,7 @@ def identifiability(
     distance = np.abs(alternatives).max(axis=0, initial=0.0)
     determined = within < UNIFORM
     errors = np.where(determined, within, errors)
-    agree = distance <= np.maximum(4 * errors, AGREEMENT)
+    agree = distance <= np.maximum(4 * errors, agreement)
     # Where a bound holds the optimum, a step of least squares without bounds leaves it.
     known = uncertainty < 1
     step = -(left[:, known].T @ residual.ravel() / singular[known]) @ directions[known]

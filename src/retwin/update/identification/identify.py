@@ -220,13 +220,10 @@ def identify(
         (Eq. 3).
 
     """
-    require(
-        isinstance(method, LeastSquares | Evolution | MCMC | NPE),
-        "method",
-        expected="LeastSquares(), Evolution(), MCMC() or NPE()",
-        got=repr(method),
-        remedy="give the settings of one of these methods",
-    )
+    known = isinstance(method, LeastSquares | Evolution | MCMC | NPE)
+    expected = "LeastSquares(), Evolution(), MCMC() or NPE()"
+    remedy = "give the settings of one of these methods"
+    require(known, "method", expected=expected, got=repr(method), remedy=remedy)
     began, missing = time.perf_counter(), ""
     if isinstance(method, LeastSquares | Evolution) and isinstance(observed, Trajectories):
         missing = unmeasured(observed)
@@ -318,22 +315,16 @@ def _samples_of(horizon: float | None, twin: ParametricTwin, observed: Trajector
     """The samples of a horizon that is given; None for one to be chosen, or for whole records."""
     if horizon is None or horizon == np.inf:
         return None
-    require(
-        state_based(twin),
-        "horizon",
-        expected="none for a twin without states",
-        got=f"{horizon:g} s for a {type(twin).__name__}",
-        remedy="starts of windows can only be estimated where the equations of the states are "
-        "known: write them as a StateTwin, or leave the horizon out",
-    )
+    expected = "none for a twin without states"
+    got = f"{horizon:g} s for a {type(twin).__name__}"
+    remedy = "starts of windows can only be estimated where the equations of the states are "
+    remedy += "known: write them as a StateTwin, or leave the horizon out"
+    require(state_based(twin), "horizon", expected=expected, got=got, remedy=remedy)
     longest = observed.steps / observed.rate
-    require(
-        2 / observed.rate <= horizon <= longest,
-        "horizon",
-        expected=f"a time from {2 / observed.rate:g} to {longest:g} s, the longest record",
-        got=f"{horizon:g} s",
-        remedy="leave it out to have it chosen",
-    )
+    inside = 2 / observed.rate <= horizon <= longest
+    expected = f"a time from {2 / observed.rate:g} to {longest:g} s, the longest record"
+    got = f"{horizon:g} s"
+    require(inside, "horizon", expected=expected, got=got, remedy="leave it out to have it chosen")
     return round(horizon * observed.rate)
 
 

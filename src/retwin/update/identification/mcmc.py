@@ -9,14 +9,11 @@ from numpy.typing import NDArray
 
 from retwin.checks import needs_extra, whole
 from retwin.progress import Progress, tracked
-from retwin.update.identification.noise import Noise
-from retwin.update.identification.problem import BoxProblem
+from retwin.update.identification.problem import BoxProblem, Noise
 from retwin.update.identification.search import LeastSquares, Search
 
 INITIAL_DEVIATION = 0.02
 """Standard deviation of the walkers' initial points about the best fit, in widths of the bounds."""
-MIN_EFFECTIVE_SAMPLES = 200.0
-"""Effective sample size below which the chains count as short."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,8 @@ class MCMC:
             "independent": independent,
         }
         short = f"short chains: the effective sample size is {independent:.0f}"
-        warning = "" if independent >= MIN_EFFECTIVE_SAMPLES else short
+        # Effective sample size below which the chains count as short.
+        warning = "" if independent >= 200.0 else short
         return chain.reshape(-1, problem.size), figures, warning
 
     def _begin(self, problem: BoxProblem, rng: np.random.Generator) -> NDArray:

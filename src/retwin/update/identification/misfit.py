@@ -96,13 +96,10 @@ class Misfit:
         if np.isnan(self.present).any():
             with suppress(SimulationError):  # what the twin itself refuses has a better message
                 twin.simulate(self._commands, seed=seed)
-        require(
-            not np.isnan(self.present).any(),
-            "twin",
-            expected="one that can simulate the commands at its present values",
-            got="a simulation that failed",
-            remedy="choose other starts of the parameters",
-        )
+        expected = "one that can simulate the commands at its present values"
+        got = "a simulation that failed"
+        remedy = "choose other starts of the parameters"
+        require(not np.isnan(self.present).any(), "twin", expected=expected, got=got, remedy=remedy)
         each = self.present.std(axis=(0, 1))
         alike = len(set(observed.outputs.units)) == 1
         self.unit = np.ones(len(each)) if alike else np.maximum(each, 1e-12)
@@ -227,20 +224,13 @@ def _in_worker(
 
 def _check_data(twin: ParametricTwin, observed: Trajectories, rate: float | None) -> int:
     """The stride of the residuals; InputError if twin and data do not fit each other."""
-    require(
-        isinstance(twin, ParametricTwin),
-        "twin",
-        expected="a ParametricTwin, which declares its free parameters",
-        got=type(twin).__name__,
-        remedy="see ParametricTwin, CommandSide and ParametricTwin.built",
-    )
+    expected = "a ParametricTwin, which declares its free parameters"
+    got = type(twin).__name__
+    remedy = "see ParametricTwin, CommandSide and ParametricTwin.built"
+    require(isinstance(twin, ParametricTwin), "twin", expected=expected, got=got, remedy=remedy)
     stride = checked_stride(twin, observed, rate, "observed")
     count = int(observed.mask[:, ::stride].sum())
-    require(
-        count > len(twin.parameters),
-        "observed",
-        expected=f"more measurements than parameters, {len(twin.parameters)}",
-        got=count,
-        remedy="give more trajectories, a higher rate, or free fewer parameters",
-    )
+    expected = f"more measurements than parameters, {len(twin.parameters)}"
+    remedy = "give more trajectories, a higher rate, or free fewer parameters"
+    require(count > len(twin.parameters), "observed", expected=expected, got=count, remedy=remedy)
     return stride

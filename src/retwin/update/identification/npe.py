@@ -10,16 +10,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import finite, needs_extra, positive, whole
 from retwin.progress import Progress, tracked
-from retwin.update.identification.noise import Noise
-from retwin.update.identification.problem import BoxProblem
-from retwin.update.identification.summaries import Summaries
-
-OVERSAMPLING = 4
-"""Draws per sample of the posterior, since those outside the prior's box are rejected."""
-MIN_ACCEPTED = 0.1
-"""Share of the samples; where fewer lie in the prior's box, draws are clipped to it instead."""
-VALIDATION = 10
-"""One in this many points is held out to choose the best epoch."""
+from retwin.update.identification.problem import BoxProblem, Noise, Summaries
 
 
 @dataclass(frozen=True)
@@ -142,7 +133,8 @@ class NPE:
 
         context, condition = (observed - mean) / scale, tensor((measured - mean) / scale)
         # Points are held out with all draws of their noise, which share the path.
-        cut = len(unit) - max(1, len(unit) // VALIDATION)
+        # One in this many points is held out to choose the best epoch.
+        cut = len(unit) - max(1, len(unit) // 10)
         fitted_on, held_out = (
             (tensor(unit[part]), tensor(context[part])) for part in (slice(cut), slice(cut, None))
         )
@@ -157,10 +149,12 @@ class NPE:
         how = Training(self.max_epochs, self.batch_size, self.learning_rate, clip=self.clip)
         fit = train(network, loss, fitted_on, held_out, how, seed=seed)
         with isolated(seed), torch.no_grad():
-            count = OVERSAMPLING * self.samples
+            # Draws per sample of the posterior, since those outside the prior's box are rejected.
+            count = 4 * self.samples
             drawn = network.sample((count,), condition=condition)[:, 0].double().numpy()
         # The network does not know the bounds of the prior: draws outside are rejected.
         inside = drawn[np.all((drawn >= 0) & (drawn <= 1), axis=1)][: self.samples]
-        if len(inside) < MIN_ACCEPTED * self.samples:
+        # Share of the samples; where fewer lie in the prior's box, draws are clipped to it instead.
+        if len(inside) < 0.1 * self.samples:
             inside = drawn[: self.samples].clip(0.0, 1.0)
         return inside, min(fit.history["validation"])

@@ -22,7 +22,7 @@ from retwin.twins.wrappers.noisy import sensor_sample_count
 from retwin.twins.wrappers.parametric import ParametricTwin
 from retwin.twins.wrappers.randomised import simulate_with_parameters
 from retwin.twins.wrappers.wrapper import TwinWrapper, chunk_generator
-from retwin.update.identification.noise import Noise
+from retwin.update.identification.problem import Noise
 
 KIND = "posterior"
 """Kind of the saved model."""
@@ -108,13 +108,10 @@ class PosteriorTwin(TwinWrapper):
         Raises InputError if the folder holds no posterior, is damaged, or has other parameters.
         """
         about, drawn = read_model(folder, KIND)
-        require(
-            tuple(about["names"]) == twin.names,
-            "twin",
-            expected=f"one with the parameters {', '.join(about['names'])}",
-            got=", ".join(twin.names),
-            remedy="give the twin whose posterior it is",
-        )
+        same = tuple(about["names"]) == twin.names
+        expected = f"one with the parameters {', '.join(about['names'])}"
+        remedy = "give the twin whose posterior it is"
+        require(same, "twin", expected=expected, got=", ".join(twin.names), remedy=remedy)
         samples, values = drawn["samples"].numpy(), np.array(about["values"])
         return cls(
             twin.with_values(values),

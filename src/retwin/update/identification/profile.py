@@ -18,9 +18,6 @@ from retwin.update.identification.misfit import misfit_of
 from retwin.update.identification.search import LeastSquares, Search
 from retwin.update.score_covariance import variance_of
 
-MARGIN = 2.0
-"""Distance of the outermost values from the optimum, in halves of the 95 % interval."""
-
 
 @dataclass(frozen=True, eq=False)
 class Profile:
@@ -73,6 +70,7 @@ def profile(
     points: int = 15,
     rate: float | None = None,
     processes: int = 1,
+    margin: float = 2.0,
 ) -> Profile:
     """The profile likelihood of one parameter about its optimum, under the loss that found it.
 
@@ -87,6 +85,8 @@ def profile(
     points : int
         Values at which it is held, at least 3, within the bounds and up to twice the half of the
         95 % interval to either side, in addition to the optimum.
+    margin : float, default 2.0
+        Distance of the outermost values from the optimum, in halves of the 95 % interval.
 
     Returns
     -------
@@ -113,7 +113,7 @@ def profile(
         search = Search(misfit, LeastSquares(starts=1), None)
         search.loss, search.scale = updated.loss, updated.scale
         best = (np.array(updated.twin.values) - misfit.low) / search.width
-        distance = MARGIN * np.sqrt(limit) * error / search.width[which]
+        distance = margin * np.sqrt(limit) * error / search.width[which]
         low, high = max(best[which] - distance, 0.0), min(best[which] + distance, 1.0)
         grid = np.unique(np.append(np.linspace(low, high, points), best[which]))
         sums = _profile_sums(search, which, grid, best)

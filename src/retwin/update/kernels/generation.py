@@ -17,14 +17,12 @@ from torch import Tensor, nn
 
 from retwin.compiler import call, compiled_files
 from retwin.data.segments import Segments
+from retwin.inference.normal import doubles
 from retwin.update.piecewise_linear import TOLERANCE
 
 SOURCES = ("network.c", "pieces.c", "warp.c", "linearised.c")
 OUTPUTS = 6
 """Outputs of a layer that are computed together, as in `network.c`."""
-DENSITY = 3.0
-"""Points of a ramp per standard deviation of the commands that it covers, beyond five; too few are
-found out, and cost a second evaluation. With 3 the default network of the arm takes least time."""
 
 
 def library() -> ctypes.CDLL | None:
@@ -40,7 +38,10 @@ def along_pieces(surrogate: Any, commands: NDArray) -> NDArray | None:
         return None
     values = np.ascontiguousarray(commands, np.float32)
     out = np.empty((*values.shape[:2], len(packed[2])), np.float32)
-    call(kernel, "pieces", values.shape[:2], DENSITY, packed, (values, out))
+    # Points of a ramp per standard deviation of the commands that it covers, beyond five; too few
+    # are found out, and cost a second evaluation. With 3 the default network of the arm takes least
+    # time.
+    call(kernel, "pieces", values.shape[:2], 3.0, packed, (values, out))
     return out
 
 
@@ -54,7 +55,7 @@ def at_effective_commands(context: Any, z: Tensor, when: Tensor) -> Tensor | Non
     n, steps, _ = reference.shape
     out = np.empty((n, when.shape[1], len(packed[2])), np.float32)
     size = reference.abs().amax(dim=0).amax(dim=0).double().numpy()
-    rows = (_floats(reference), *_times(segments), _floats(z), *map(_doubles, (frozen, when)), out)
+    rows = (_floats(reference), *_times(segments), _floats(z), *map(doubles, (frozen, when)), out)
     sizes = (n, steps, segments.max_count, when.shape[1])
     call(kernel, "executed", sizes, 0.0, (*packed[:2], size), rows)
     return torch.from_numpy(out)
@@ -91,9 +92,9 @@ def effective_commands_at(
     out = np.empty((n, samples, reference.shape[2]))
     size = reference.abs().amax(dim=0).amax(dim=0).clamp_min(1e-12)
     source = np.arange(n) * len(reference) // n
-    rows = (source, *_times(segments), *map(_doubles, (z, frozen, times)), out)
+    rows = (source, *_times(segments), *map(doubles, (z, frozen, times)), out)
     sizes = (n, reference.shape[1], segments.max_count, samples, reference.shape[2])
-    call(kernel, "commands", sizes, 0.0, (_doubles(size), _doubles(reference)), rows)
+    call(kernel, "commands", sizes, 0.0, (doubles(size), doubles(reference)), rows)
     return torch.from_numpy(out)
 
 
@@ -120,9 +121,9 @@ def linearised_outputs(problem: Any, x: Tensor, step: float) -> tuple[Tensor, Te
     jacobian = np.empty((*found.shape, x.shape[1]))
     size = reference.abs().amax(dim=0).amax(dim=0).clamp_min(1e-12)
     sizes = n, reference.shape[1], problem.segments.max_count, samples, int(problem.own_delays)
-    common = (*packed[:2], _doubles(size), _doubles(problem.unit))
-    rows = map(_doubles, (x, problem.missed, problem.frozen, problem.sample))
-    given = (_doubles(reference), *_times(problem.segments), *rows)
+    common = (*packed[:2], doubles(size), doubles(problem.unit))
+    rows = map(doubles, (x, problem.missed, problem.frozen, problem.sample))
+    given = (doubles(reference), *_times(problem.segments), *rows)
     call(kernel, "linearised", sizes, step, common, (*given, found, jacobian))
     return torch.from_numpy(found), torch.from_numpy(jacobian)
 
@@ -196,7 +197,3 @@ def _times(segments: Segments) -> tuple[NDArray, NDArray, NDArray]:
 
 def _floats(values: Tensor) -> NDArray:
     return np.ascontiguousarray(values.detach().numpy(), np.float32)
-
-
-def _doubles(values: Tensor) -> NDArray:
-    return np.ascontiguousarray(values.detach().numpy(), np.float64)

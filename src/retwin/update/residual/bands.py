@@ -16,10 +16,6 @@ from retwin.update.residual.residual import Residual
 DRAWS = 59
 """Draws of each trajectory: a measured sample has one of 60 ranks among them, all equally probable
 if the model is right."""
-OUTER = 3
-"""Ranks outside the band at each end: 54 of 60 ranks are 90 %."""
-MAX_TRAJECTORIES = 60
-"""Trajectories that are compared, so that it takes seconds."""
 TOO_FEW = 0.7
 """Share of measured samples in a band of 90 % below which a warning is given: it misses three times
 as many as it states."""
@@ -27,7 +23,7 @@ as many as it states."""
 
 @torch.no_grad()
 def coverage(
-    model: Residual, context: Context, observed: Tensor, mask: Tensor, *, seed: int
+    model: Residual, context: Context, observed: Tensor, mask: Tensor, *, seed: int, outer: int = 3
 ) -> NDArray:
     """Share of measured samples in the central 90 % of draws, (n, d_y); NaN where none is measured.
 
@@ -41,6 +37,8 @@ def coverage(
         (n, T, d_y), with a mask that is True for the sensor's own samples.
     seed : int
         Of the draws.
+    outer : int, default 3
+        Ranks outside the band at each end: 54 of 60 ranks are 90 %.
 
     """
     generator = torch.Generator().manual_seed(seed)
@@ -51,7 +49,7 @@ def coverage(
         # Equal values, as of a sensor that rounds, are below and above in turn.
         above = torch.rand(drawn.shape, generator=generator) < 0.5
         rank += (drawn < observed) | ((drawn == observed) & above)
-    inside = (rank >= OUTER) & (rank <= DRAWS - OUTER) & mask
+    inside = (rank >= outer) & (rank <= DRAWS - outer) & mask
     count = mask.sum(dim=1)
     return torch.where(count > 0, inside.sum(dim=1).double() / count, torch.nan).numpy()
 
@@ -68,7 +66,8 @@ def coverage_figures(
         interval over trajectories.
 
     """
-    part = slice(0, MAX_TRAJECTORIES)
+    # Trajectories that are compared, so that it takes seconds.
+    part = slice(0, 60)
     shares = coverage(model, context[part], observed[part], mask[part], seed=seed)
     figures, low = {}, {}
     for name, own in zip(model.outputs.names, shares.T, strict=True):

@@ -169,13 +169,10 @@ def fit_residual(
             context = replace(context, nominal=torch.as_tensor(exact.fitted_outputs(used)))
         warn_of_error(context, used)
         correction, found = fit_correction(correction, context, *_measured(used))
-    require(
-        found.identified.any(),
-        "calibration",
-        expected="measurements that identify the discrepancy",
-        got=f"{int(used.mask.all(axis=2).sum())} samples with all outputs measured",
-        remedy="check the mask; leave an output out that is never measured",
-    )
+    expected = "measurements that identify the discrepancy"
+    got = f"{int(used.mask.all(axis=2).sum())} samples with all outputs measured"
+    remedy = "check the mask; leave an output out that is never measured"
+    require(found.identified.any(), "calibration", expected=expected, got=got, remedy=remedy)
     task = ResidualTask(used, correction, context, found, bounds, seed, progress)
     if isinstance(density, StationaryNoise):
         model: Residual[Any] = fit_stationary(task, density)
@@ -205,13 +202,11 @@ def _segmented(
         rule, parts = segments, segment(used.commands, used.nominal, segments)
     else:
         rule, parts = "commands", segments
-    require(
-        parts.valid.any() or not needed,
-        "calibration",
-        expected="trajectories with segments of motion",
-        got="commands that never change",
-        remedy="give segments='path', or the segments themselves",
-    )
+    moving = parts.valid.any() or not needed
+    expected = "trajectories with segments of motion"
+    got = "commands that never change"
+    remedy = "give segments='path', or the segments themselves"
+    require(moving, "calibration", expected=expected, got=got, remedy=remedy)
     return rule, parts
 
 
@@ -289,12 +284,9 @@ def calibrating(
     elif calibrate_on in ("healthy", "all"):
         keep = (labels == HEALTHY) | (calibrate_on == "all")
     else:
-        raise InputError(
-            "calibrate_on",
-            expected="'healthy', 'all', or a mapping from label to fault",
-            got=repr(calibrate_on),
-            remedy="'all' lets the offset absorb faults; use it for comparison only",
-        )
+        expected = "'healthy', 'all', or a mapping from label to fault"
+        remedy = "'all' lets the offset absorb faults; use it for comparison only"
+        raise InputError("calibrate_on", expected=expected, got=repr(calibrate_on), remedy=remedy)
     wanted = repr(HEALTHY) if isinstance(calibrate_on, str) else ", ".join(calibrate_on)
     require(
         keep.any(),

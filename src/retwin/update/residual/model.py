@@ -13,7 +13,7 @@ from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.nets.networks import Standardise
 from retwin.nets.student import Student, shared_factor
 from retwin.update.corrections import Context
-from retwin.update.corrections.warp import gather_samples
+from retwin.update.corrections.delays import gather_samples
 from retwin.update.residual.residual import Residual
 from retwin.update.residual.settings import Density
 

@@ -42,23 +42,17 @@ def other_machines(
         len(models), "prior", expected="models of other machines", got="none", remedy="name one"
     )
     operator = before_sensor(correction)
-    require(
-        isinstance(operator, CommandSpace),
-        "prior",
-        expected="a correction with CommandSpace, alone or before a SampledSensor",
-        got=f"{type(operator).__name__}, which learns nothing that machines have in common",
-        remedy="leave the prior out, or correct in command space",
-    )
+    expected = "a correction with CommandSpace, alone or before a SampledSensor"
+    got = f"{type(operator).__name__}, which learns nothing that machines have in common"
+    remedy = "leave the prior out, or correct in command space"
+    require(isinstance(operator, CommandSpace), "prior", expected=expected, got=got, remedy=remedy)
     shown = []
     for each in models:
         model, name = _residual(each)
-        require(
-            type(before_sensor(model.correction)) is type(operator),
-            "prior",
-            expected="models with CommandSpace, as this one",
-            got=f"{type(before_sensor(model.correction)).__name__} in {name}",
-            remedy="leave it out",
-        )
+        alike = type(before_sensor(model.correction)) is type(operator)
+        expected = "models with CommandSpace, as this one"
+        got = f"{type(before_sensor(model.correction)).__name__} in {name}"
+        require(alike, "prior", expected=expected, got=got, remedy="leave it out")
         remedy = f"leave {name} out: it is no machine of this kind"
         agree("prior", model, twin, "those of the twin", names=("inputs", "outputs"), remedy=remedy)
         expected, got = "models that state what their machine has shown", f"none in {name}"

@@ -24,10 +24,6 @@ from retwin.update.corrections import Context, measured_outputs
 from retwin.update.residual.model import ResidualModel, describe
 from retwin.update.residual.settings import Refinement
 
-HELD_OUT_DRAWS = 64
-"""Simulations of each held-out trajectory that the energy score before and after is estimated
-from. They are four times as many as in training by default, to halve the error of the estimate."""
-
 
 def refine(
     model: ResidualModel,
@@ -40,6 +36,7 @@ def refine(
     how: Refinement,
     seed: int,
     progress: Progress | None = None,
+    held_out_draws: int = 64,
 ) -> dict[str, float]:
     """Refine `model` in place if that lowers the energy score of held-out trajectories.
 
@@ -59,6 +56,10 @@ def refine(
         Seed of the draws and of the training.
     progress : callable, optional
         Called with the share of the epochs that are done.
+    held_out_draws : int, default 64
+        Simulations of each held-out trajectory that the energy score before and after is estimated
+        from. They are four times as many as in training by default, to halve the error of the
+        estimate.
 
     Returns
     -------
@@ -95,7 +96,7 @@ def refine(
     @torch.no_grad()
     def held_out_score() -> float:
         batch = (features[held_out], held_out)
-        return float(score(model.eval(), batch, HELD_OUT_DRAWS, seed + 1))
+        return float(score(model.eval(), batch, held_out_draws, seed + 1))
 
     before, start = held_out_score(), copy.deepcopy(model.state_dict())
     for part in frozen:

@@ -98,13 +98,8 @@ class Residual(nn.Module, ABC, Generic[D]):
         suits = getattr(correction, "resolution", "") == self.resolution
         if suits and self.resolution == "step":
             suits = all(each.kind == "mixture" for each in correction.heads(inputs, outputs))
-        require(
-            suits,
-            "correction",
-            expected=self.wanted,
-            got=repr(correction),
-            remedy=self.remedy,
-        )
+        expected = self.wanted
+        require(suits, "correction", expected=expected, got=repr(correction), remedy=self.remedy)
         self.latent = correction.latent(inputs, outputs)
         self.sizes = [head.width for head in correction.heads(inputs, outputs)]
         self.degrees = [math.inf] * len(self.sizes)
@@ -172,13 +167,10 @@ class Residual(nn.Module, ABC, Generic[D]):
         """Take the bounds b (d_z,) of a user, if any; InputError unless all are positive."""
         if bounds is None:
             return
-        require(
-            np.shape(bounds) == self.bounds.shape and (np.asarray(bounds) > 0).all(),
-            "bounds",
-            expected=f"one positive bound for each of {', '.join(self.latent.names)}",
-            got=repr(bounds),
-            remedy="leave bounds out to take them from the data",
-        )
+        fits = np.shape(bounds) == self.bounds.shape and (np.asarray(bounds) > 0).all()
+        expected = f"one positive bound for each of {', '.join(self.latent.names)}"
+        remedy = "leave bounds out to take them from the data"
+        require(fits, "bounds", expected=expected, got=repr(bounds), remedy=remedy)
         self.bounds.copy_(torch.as_tensor(bounds, dtype=torch.float32))
 
     @abstractmethod

@@ -21,9 +21,6 @@ from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.residual import BOUND_MARGIN, SMALLEST
 from retwin.update.residual.targets import ResidualTask, Targets
 
-HELD_OUT = 20
-"""Trajectories to hold out at least, over all folds: a standard deviation from twenty values has a
-standard error of 16 %."""
 SPREADS = np.geomspace(1.0, 4.0, 57)
 """Candidates for the factor of the deviations, 2.5 % from one to the next: none is narrower than
 what was learned."""
@@ -107,11 +104,19 @@ def fit_segments(model: ResidualModel, targets: Targets, task: ResidualTask) -> 
     return replace(fits[-1], figures=figures), rows[folds[0]] if len(rows) > 1 else rows[:0]
 
 
-def _folds(count: int, seed: int) -> list[Tensor]:
-    """The trajectories that each fold holds out, as many folds as hold out enough in all."""
+def _folds(count: int, seed: int, *, held_out: int = 20) -> list[Tensor]:
+    """The trajectories that each fold holds out, as many folds as hold out enough in all.
+
+    Parameters
+    ----------
+    held_out : int, default 20
+        Trajectories to hold out at least, over all folds: a standard deviation from twenty values
+        has a standard error of 16 %.
+
+    """
     order = torch.as_tensor(np.random.default_rng(seed).permutation(count))
     size = max(1, round(0.2 * count))
-    return list(order.split(size)[: -(-HELD_OUT // size)])
+    return list(order.split(size)[: -(-held_out // size)])
 
 
 def _trained(

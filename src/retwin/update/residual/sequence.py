@@ -104,14 +104,10 @@ class SequenceMixture:
             and 0 <= self.dropout < 1
             and 0 <= self.moderation <= 1
         )
-        require(
-            sound,
-            "density",
-            expected="members of at least 2, features, components, block, max_steps of at least 1, "
-            "burn_in below window, dropout and moderation from 0 to 1",
-            got=repr(self),
-            remedy="leave out what you do not need to change",
-        )
+        expected = "members of at least 2, features, components, block, max_steps of at least 1, "
+        expected += "burn_in below window, dropout and moderation from 0 to 1"
+        remedy = "leave out what you do not need to change"
+        require(sound, "density", expected=expected, got=repr(self), remedy=remedy)
 
 
 class Member(nn.Module):

@@ -26,8 +26,6 @@ from retwin.update.residual.targets import ResidualTask
 
 SPREADS = np.geomspace(0.5, 4.0, 85)
 """Candidates for the factor of the standard deviations, 2.5 % from one to the next."""
-QUANTILE90 = 1.6449
-"""Absolute value that a standard normal variable exceeds with probability 0.1."""
 MAX_PERSISTENCE = 0.999
 """Largest persistence; beyond it the correlation time exceeds the length of common records."""
 
@@ -64,13 +62,11 @@ def fit_sequence(task: ResidualTask, density: SequenceMixture) -> SequenceResidu
     data = _Records(past(task.context), found.z.float(), identified, torch.as_tensor(used.lengths))
     valid = torch.arange(used.steps) < data.lengths[:, None]
     held_out = held_out_parts(valid, density)
-    require(
-        (held_out & identified).flatten(1).any(dim=1).all(),
-        "calibration",
-        expected=f"measurements in each of {density.members} parts of the data",
-        got=f"{int(identified.sum())} measured samples, some parts with none",
-        remedy="give longer records, fewer members, or shorter blocks",
-    )
+    measured = (held_out & identified).flatten(1).any(dim=1).all()
+    expected = f"measurements in each of {density.members} parts of the data"
+    got = f"{int(identified.sum())} measured samples, some parts with none"
+    remedy = "give longer records, fewer members, or shorter blocks"
+    require(measured, "calibration", expected=expected, got=got, remedy=remedy)
     _prepare(model, data, task.bounds, seed)
     fitted = torch.stack([identified & ~_dilate(part, density.margin) for part in held_out])
     rounds = 1 + density.refit
@@ -87,11 +83,7 @@ def fit_sequence(task: ResidualTask, density: SequenceMixture) -> SequenceResidu
 
 
 def _train_members(
-    model: SequenceResidual,
-    data: _Records,
-    fitted: Tensor,
-    seed: int,
-    progress: Progress | None,
+    model: SequenceResidual, data: _Records, fitted: Tensor, seed: int, progress: Progress | None
 ) -> Fit:
     """Train all members together to the last epoch on their samples `fitted` (K, n, T).
 
@@ -228,11 +220,12 @@ def _calibrate(model: SequenceResidual, data: _Records, held_out: Tensor) -> dic
     scores = distribution.normal_scores(data.z.expand_as(means))
     if model.density.persistent:
         model.persistence.copy_(_persistence(scores, held_out))
+    # Absolute value that a standard normal variable exceeds with probability 0.1.
     figures = {
         "samples": float(held_out.sum()),
         "nll": -log_likelihood(spread) / int(held_out.sum()),
         "spread": spread,
-        "coverage90": float((scores[held_out].abs() < QUANTILE90).float().mean()),
+        "coverage90": float((scores[held_out].abs() < 1.6449).float().mean()),
     }
     error = distribution.mean[held_out] - z
     by_name = {

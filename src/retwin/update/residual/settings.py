@@ -69,13 +69,10 @@ class Density(ABC):
     refinement: Refinement | None = None
 
     def __post_init__(self) -> None:
-        require(
-            0 <= self.dropout < 1,
-            "dropout",
-            expected="a number from 0 to below 1",
-            got=self.dropout,
-            remedy="leave it out for the default",
-        )
+        expected = "a number from 0 to below 1"
+        got = self.dropout
+        remedy = "leave it out for the default"
+        require(0 <= self.dropout < 1, "dropout", expected=expected, got=got, remedy=remedy)
 
     @abstractmethod
     def head(self, features: int, width: int) -> nn.Module:

@@ -34,10 +34,6 @@ from retwin.twins.twin import Twin
 from retwin.twins.wrappers.parametric import Parameter
 from retwin.update.dynamics.unknowns import coefficients_of
 
-PAST = 10
-"""Least number of past samples from which the first estimate of the states is made."""
-STABLE = 0.999
-"""Largest modulus of an eigenvalue of the linear part where it begins."""
 DISTINCT = 1e-10
 """Singular values, over the largest one, below which columns are combinations of others."""
 
@@ -211,12 +207,19 @@ Linear = tuple[NDArray, ...]
 """A, B, c, C, D and e of a linear model."""
 
 
-def _linear(v: NDArray, y: NDArray, order: int) -> Linear:
+def _linear(v: NDArray, y: NDArray, order: int, *, stable: float = 0.999) -> Linear:
     """A linear model by a subspace method, from inputs (n, T, d_v) and outputs (n, T, d_y).
 
     The states are the leading components of what past samples predict of future outputs.
+
+    Parameters
+    ----------
+    stable : float, default 0.999
+        Largest modulus of an eigenvalue of the linear part where it begins.
+
     """
-    lags = min(max(PAST, 2 * order), (v.shape[1] - 1) // 3)
+    # Least number of past samples from which the first estimate of the states is made.
+    lags = min(max(10, 2 * order), (v.shape[1] - 1) // 3)
     count = v.shape[1] - 2 * lags + 1
 
     def window(values: NDArray, begins: Sequence[int]) -> NDArray:
@@ -242,7 +245,7 @@ def _linear(v: NDArray, y: NDArray, order: int) -> Linear:
     parts = [(each[:, :order], each[:, order:-1], each[:, -1]) for each in (flow, read)]
     (a, b, c), (out, direct, e) = parts
     modulus = float(np.abs(np.linalg.eigvals(a)).max())
-    return a * min(1.0, STABLE / max(modulus, 1e-300)), b, c, out, direct, e
+    return a * min(1.0, stable / max(modulus, 1e-300)), b, c, out, direct, e
 
 
 def _start(model: Linear, v: NDArray, y: NDArray) -> NDArray:

@@ -34,9 +34,6 @@ from retwin.update.state_surrogate.simulations import (
 )
 
 KIND = "state_surrogate"
-MARGIN = 0.25
-"""How far beyond the commands of the simulations the surrogate takes commands, in widths of their
-range; other draws of the same sampler are within."""
 SMALL = 0.5
 """Largest error of a surrogate over the discrepancy of its twin, both root mean squares."""
 
@@ -241,14 +238,23 @@ def _twin_of(
     own: Sequence[NDArray],
     *,
     unknown_start: bool,
+    margin: float = 0.25,
 ) -> StateTwin:
-    """The surrogate, whose limits are those of the commands in simulations, with a margin."""
+    """The surrogate, whose limits are those of the commands in simulations, with a margin.
+
+    Parameters
+    ----------
+    margin : float, default 0.25
+        How far beyond the commands of the simulations the surrogate takes commands, in widths of
+        their range; other draws of the same sampler are within.
+
+    """
     simulated, parameters = _split(training, len(twin.inputs))
     low, high = (
         make([make(each, axis=(0, 1)) for each in (simulated, *own)], axis=0)
         for make in (np.min, np.max)
     )
-    low, high = low - MARGIN * (high - low), high + MARGIN * (high - low)
+    low, high = low - margin * (high - low), high + margin * (high - low)
     limits = getattr(twin, "limits", None)
     if limits is not None:
         low, high = np.maximum(low, limits.low), np.minimum(high, limits.high)

@@ -28,8 +28,6 @@ MIN_SIMULATIONS = 10
 LATER, LARGER = 200, 3.0
 """The sample of a later pulse, and the ratio of effects of the first pulse and this one, from which
 the start depends on the first command."""
-FAILED = 0.2
-"""Largest share of the simulations that may fail."""
 
 
 def drawn_parameters(twin: Twin, spread: float) -> tuple[Parameter, ...]:
@@ -107,13 +105,10 @@ class Simulations:
     def _of(self, sampler: CommandSampler, count: int, rng: np.random.Generator) -> Trajectories:
         u = sampler.sample(count, rng=rng).astype(np.float64)
         u = beginning_with(self.first, u[:, : MAX_SAMPLES // MIN_SIMULATIONS])
-        require(
-            u.shape[1] >= MIN_SAMPLES,
-            "commands",
-            expected=f"trajectories of {MIN_SAMPLES} samples or more",
-            got=u.shape[1],
-            remedy="draw longer ones, in which the twin's memory shows",
-        )
+        expected = f"trajectories of {MIN_SAMPLES} samples or more"
+        got = u.shape[1]
+        remedy = "draw longer ones, in which the twin's memory shows"
+        require(u.shape[1] >= MIN_SAMPLES, "commands", expected=expected, got=got, remedy=remedy)
         drawn = {each.name: rng.uniform(each.low, each.high, count) for each in self.parameters}
         options: dict[str, Any] = {"parameters": drawn} if drawn else {}
         began = time.perf_counter()
@@ -121,13 +116,12 @@ class Simulations:
             made = self.twin.simulate(u, seed=int(rng.integers(2**31)), **options)
         except SimulationError as error:
             made, self.reason = error.finished, f"of {count} simulations {len(error.failed)} failed"
-            if len(error.failed) > FAILED * count:
-                raise InputError(
-                    "twin",
-                    expected="simulations that succeed, of commands and parameters as drawn",
-                    got=str(error),
-                    remedy="narrow the bounds of the parameters, or give a smaller spread",
-                ) from error
+            # Largest share of the simulations that may fail.
+            if len(error.failed) > 0.2 * count:
+                expected = "simulations that succeed, of commands and parameters as drawn"
+                got = str(error)
+                remedy = "narrow the bounds of the parameters, or give a smaller spread"
+                raise InputError("twin", expected=expected, got=got, remedy=remedy) from error
         self.seconds = (time.perf_counter() - began) / u[..., 0].size
         rows = made.ids.astype(int)
         held = [np.repeat(each[rows, None, None], u.shape[1], axis=1) for each in drawn.values()]
@@ -172,10 +166,7 @@ def check_outputs(training: Trajectories) -> None:
     spread = np.where(training.mask, training.observed, np.nan)
     fixed = np.nanmax(spread, axis=(0, 1)) == np.nanmin(spread, axis=(0, 1))
     names = [name for name, each in zip(training.outputs.names, fixed, strict=True) if each]
-    require(
-        not names,
-        "twin",
-        expected="outputs that change in its simulations",
-        got=f"outputs that do not: {', '.join(names)}",
-        remedy="leave such outputs out, or give commands that excite them",
-    )
+    expected = "outputs that change in its simulations"
+    got = f"outputs that do not: {', '.join(names)}"
+    remedy = "leave such outputs out, or give commands that excite them"
+    require(not names, "twin", expected=expected, got=got, remedy=remedy)

@@ -54,12 +54,9 @@ def _check_database(path: Path) -> None:
     import sqlite3
 
     if re.search(r"[?#%]", str(path)):
-        raise InputError(
-            str(path),
-            expected="a path without ?, # and %",
-            got="one of them",
-            remedy="rename the file or its folder",
-        )
+        expected = "a path without ?, # and %"
+        remedy = "rename the file or its folder"
+        raise InputError(str(path), expected=expected, got="one of them", remedy=remedy)
     connection = sqlite3.connect(f"file:{path}?immutable=1", uri=True)
     with closing(connection):
         connection.execute("PRAGMA trusted_schema = OFF")

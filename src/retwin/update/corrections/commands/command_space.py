@@ -19,8 +19,8 @@ from retwin.update.corrections.commands.effective_commands import effective_comm
 from retwin.update.corrections.commands.inference import Hyperparameters, infer_commands
 from retwin.update.corrections.correction import Context, Discrepancy, Head
 from retwin.update.corrections.delay_range import checked_range, range_in_samples, range_in_seconds
+from retwin.update.corrections.delays import gather_samples
 from retwin.update.corrections.surrogate_slopes import outputs_at
-from retwin.update.corrections.warp import gather_samples
 from retwin.update.kernels.generation import at_effective_commands
 
 KINDS = ("offset", "missed")

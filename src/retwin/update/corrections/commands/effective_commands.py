@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from retwin.data.segments import Segments
-from retwin.update.corrections.warp import Knots, gather_samples, interpolate
+from retwin.update.corrections.delays import Knots, gather_samples, interpolate
 from retwin.update.kernels.generation import effective_commands_at
 
 STILL = 1e-6

@@ -9,7 +9,6 @@ Whether an actuator missed a segment is decided by comparing evidence.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -40,27 +39,10 @@ from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.sample_noise import SampleNoise
 from retwin.workers.threads import one_thread
 
-MAX_ROUNDS = 12
-"""Rounds of expectation-maximisation at most, with a search for missed segments in each."""
-TOLERANCE = 0.02
-"""Relative change of all standard deviations below which they have converged."""
-SUSPECT = 2.5
-"""Standard deviations of the prior beyond which an offset makes a segment suspect."""
 MOVING = 3.0
 """Distance, in standard deviations of an offset, above which an actuator is to move."""
-OUTLYING = 3.0
-"""Noise scales beyond which a sample is an outlier."""
-OUTLYING_SHARE = 0.3
-"""Share of outliers above which a segment is suspect."""
-FIRST_ODDS = -4.0
-"""Log odds at first that an actuator misses a segment: about one in fifty."""
 FIRST_JITTER = 1 / 35
 """Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
-SMALLEST_SHARE = 0.1
-"""Smallest share of the samples that is taken to be left after z* has been fitted to them."""
-PREDICTED = 20
-"""Runs, measured and predicted, from which a distribution is learned: as many trajectories as a
-residual model is calibrated on. Of fewer, the hyperparameters' posterior predicts the rest."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -74,10 +56,19 @@ def infer_commands(
     delay_range: tuple[float, float],
     max_samples: int,
     identified_below: float,
+    max_rounds: int = 12,
+    first_odds: float = -4.0,
 ) -> tuple[Discrepancy, Hyperparameters | None]:
     """z* (n, M, 1 + 2 d_u) for measured outputs (n, T, d_y), see `CommandSpace`.
 
     The range of delays is in samples.
+
+    Parameters
+    ----------
+    max_rounds : int, default 12
+        Rounds of expectation-maximisation at most, with a search for missed segments in each.
+    first_odds : float, default -4.0
+        Log odds at first that an actuator misses a segment: about one in fifty.
 
     Returns
     -------
@@ -103,7 +94,7 @@ def infer_commands(
     replicates = features.replicates(problem)
     uncertain = problem.counted_once(replicates)
     problem = uncertain.where_certain
-    missed = first_missed(problem, features.unit, FIRST_ODDS)
+    missed = first_missed(problem, features.unit, first_odds)
     problem = problem.with_missed(missed)
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
     others = context.others
@@ -125,7 +116,7 @@ def infer_commands(
         if regression and not learned.explained(problem, found.fit, weight):
             break
         learned = learned.with_regression(problem, regression)
-        for _ in range(MAX_ROUNDS):
+        for _ in range(max_rounds):
             found, before = infer(found, learned), learned
             missed, solution = found.fit.missed, found.fit.solution
             learned = before.learned(problem.with_missed(missed), solution, weight)
@@ -159,13 +150,10 @@ def _require_samples(mask: Tensor) -> None:
     empty = ~mask.all(dim=-1).any(dim=1)
     index = empty.nonzero()[:, 0].tolist()
     several = len(index) > 1
-    require(
-        not index or not mask.any(),
-        "mask",
-        expected="in every trajectory at least one sample at which all outputs are measured",
-        got=f"none in {'trajectories' if several else 'trajectory'} {', '.join(map(str, index))}",
-        remedy=f"leave {'them' if several else 'it'} out, or correct the mask",
-    )
+    expected = "in every trajectory at least one sample at which all outputs are measured"
+    got = f"none in {'trajectories' if several else 'trajectory'} {', '.join(map(str, index))}"
+    remedy = f"leave {'them' if several else 'it'} out, or correct the mask"
+    require(not index or not mask.any(), "mask", expected=expected, got=got, remedy=remedy)
 
 
 def _empty(problem: CommandProblem) -> Discrepancy:
@@ -189,10 +177,13 @@ def _suspects(
     offsets = slice(1, 1 + part.missed.shape[2])
     width = part.per_segment(prior.gaussian.deviation[rows])[..., offsets]
     away = part.per_segment(x - prior.gaussian.mean[rows])[..., offsets]
-    far = (away.abs() > SUSPECT * width) & part.healthy
-    outlying = noise.square(part, part.residual(x)) > OUTLYING**2
+    # Standard deviations of the prior beyond which an offset makes a segment suspect.
+    far = (away.abs() > 2.5 * width) & part.healthy
+    # Noise scales beyond which a sample is an outlier.
+    outlying = noise.square(part, part.residual(x)) > 3.0**2
     share = (part.inside * outlying[:, None]).sum(dim=-1) / part.inside.sum(dim=-1).clamp_min(1)
-    suspect = far.any(dim=-1) | (share > OUTLYING_SHARE)
+    # Share of outliers above which a segment is suspect.
+    suspect = far.any(dim=-1) | (share > 0.3)
     moving = part.way > MOVING * width
     flips = suspect[..., None] & moving & part.healthy | (part.missed > 0.5)
     row, segment, actuator = flips.nonzero().unbind(dim=1)
@@ -328,19 +319,27 @@ class Hyperparameters:
         covariance = self.hierarchy.posterior_covariance(design, likelihood)
         fitted = (likelihood.curvature * covariance).sum()  # dimensions that outputs determine
         count = white.measured.sum() * white.observed.shape[2]
-        left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
+        # Smallest share of the samples that is taken to be left after z* has been fitted to them.
+        left = (1 - fitted / count.clamp_min(1.0)).clamp(0.1, 1.0)
         rest, path = learned.thinning
         rest = rest.clamp_min(white.creep(learned, residual))
         thinning = torch.stack([rest, path])
         return replace(learned, scale=learned.scale / left.sqrt(), thinning=thinning)
 
-    def near(self, other: Hyperparameters) -> bool:
-        """Whether all standard deviations are about those of `other`."""
+    def near(self, other: Hyperparameters, *, tolerance: float = 0.02) -> bool:
+        """Whether all standard deviations are about those of `other`.
+
+        Parameters
+        ----------
+        tolerance : float, default 0.02
+            Relative change of all standard deviations below which they have converged.
+
+        """
         pairs = (
             (self.hierarchy.total().sqrt(), other.hierarchy.total().sqrt()),
             (self.noise.scale, other.noise.scale),
         )
-        return all(bool(((a / b).log().abs() < TOLERANCE).all()) for a, b in pairs)
+        return all(bool(((a / b).log().abs() < tolerance).all()) for a, b in pairs)
 
 
 def _discrepancy(
@@ -396,16 +395,15 @@ def _odds(problem: CommandProblem, assumed: tuple[float, float]) -> Tensor:
 
 
 def _predict_runs(
-    problem: CommandProblem,
-    design: Design,
-    draws: Sequence[Hierarchy],
-    assumed: tuple[float, float],
+    problem: CommandProblem, design: Design, draws: list[Hierarchy], assumed: tuple[float, float]
 ) -> Tensor | None:
     """Draws (J, M, 1 + 2 d_u) of z in further runs, under conditions that were not seen.
 
     None from enough runs.
     """
-    further = PREDICTED - len(problem)
+    # Runs, measured and predicted, from which a distribution is learned: as many trajectories as a
+    # residual model is calibrated on. Of fewer, the hyperparameters' posterior predicts the rest.
+    further = 20 - len(problem)
     if further <= 0:
         return None
     rng, runs = np.random.default_rng(2), []

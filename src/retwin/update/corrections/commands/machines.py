@@ -26,8 +26,6 @@ FACTOR = 2 * math.log(1.5)
 deviations differ by a factor of 1.5."""
 MISSED = 0.5, 20.0
 """Missed segments, and segments, that are assumed besides those of each machine."""
-STEPS = 200
-"""Steps of expectation-maximisation."""
 
 Learned = dict[str, list[list[float]]]
 """What a machine has shown: means and variances of each kind of hyperparameter, `delay` in s,
@@ -128,7 +126,8 @@ def _predict(shown: NDArray, variance: NDArray, kind: str) -> tuple[NDArray, NDA
     """
     usual = FACTOR**2 if kind.startswith("log_") else float(np.square(shown).mean())
     between = usual
-    for _ in range(STEPS):
+    # Steps of expectation-maximisation.
+    for _ in range(200):
         weight = 1 / (variance + between)
         total = weight.sum(axis=0)
         mean = (weight * shown).sum(axis=0) / total

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from retwin.inference.noise import Noise
-from retwin.inference.priors import GaussianPrior
-from retwin.inference.problem import Rows
+from retwin.inference.problem import GaussianPrior, Rows
 from retwin.inference.solver import Solution, added_evidence, best_per_row, solve
 from retwin.update.corrections.commands.problem import CommandProblem
 

@@ -16,15 +16,6 @@ from retwin.update.corrections.commands.effective_commands import STILL
 from retwin.update.corrections.commands.problem import CommandProblem
 from retwin.update.corrections.correction import DifferentiableTwin
 
-OWN_FEATURES = 3
-"""Features of an actuator's own motion: a constant, its direction, and its distance."""
-MAX_COEFFICIENTS = 500
-"""Largest number of coefficients in all with which offsets depend on the targets of all actuators;
-with more actuators, each offset depends on its own actuator's target only."""
-MAX_EFFECTS = 1000
-"""Largest number of effects of conditions; of more conditions the last ones have none."""
-EQUAL = 0.01
-"""Distance, in the spread of the targets, below which commands are equal."""
 FIRST_OFFSET = 0.05
 """Standard deviation of an offset at first, in that of the targets of actuators of its kind, and
 the scale of its half-normal prior."""
@@ -70,10 +61,16 @@ class OffsetFeatures:
     constants_expected: bool = False
 
     @classmethod
-    def of(cls, problem: CommandProblem) -> OffsetFeatures:
+    def of(cls, problem: CommandProblem, *, max_effects: int = 1000) -> OffsetFeatures:
         """The scales of the commands of `problem`; 1 where an actuator never moves.
 
         Where all targets are the same, as in a single segment, distances stand for their spread.
+
+        Parameters
+        ----------
+        max_effects : int, default 1000
+            Largest number of effects of conditions; of more conditions the last ones have none.
+
         """
         first, last = (each[problem.valid] for each in problem.levels)
         centre = last.mean(dim=0)
@@ -86,11 +83,18 @@ class OffsetFeatures:
         unit = FIRST_OFFSET * _pool_alike(spread, moved, problem.surrogate)
         found = cls(centre, spread, travel, unit, centre.new_zeros(0, 2 * len(centre)))
         every, counts = found.conditions(problem)[problem.valid].unique(dim=0, return_counts=True)
-        return replace(found, replicated=every[counts > 1][: MAX_EFFECTS // problem.size])
+        return replace(found, replicated=every[counts > 1][: max_effects // problem.size])
 
-    def conditions(self, problem: CommandProblem) -> Tensor:
-        """(n, M, 2 d_u), commands before and after each segment, in multiples of what is equal."""
-        scaled = [(each - self.centre) / (EQUAL * self.spread) for each in problem.levels]
+    def conditions(self, problem: CommandProblem, *, equal: float = 0.01) -> Tensor:
+        """(n, M, 2 d_u), commands before and after each segment, in multiples of what is equal.
+
+        Parameters
+        ----------
+        equal : float, default 0.01
+            Distance, in the spread of the targets, below which commands are equal.
+
+        """
+        scaled = [(each - self.centre) / (equal * self.spread) for each in problem.levels]
         return torch.cat(scaled, dim=-1).round()
 
     def replicates(self, problem: CommandProblem) -> Tensor:
@@ -162,8 +166,18 @@ class OffsetFeatures:
         size = problem.reference.abs().amax(dim=(0, 1))
         return (last - first).sign() * ((last - first).abs() > STILL * size)
 
-    def _features(self, problem: CommandProblem) -> Tensor:
-        """(n, M, d_u, F), those of every actuator's offset."""
+    def _features(self, problem: CommandProblem, *, max_coefficients: int = 500) -> Tensor:
+        """(n, M, d_u, F), those of every actuator's offset.
+
+        Three are of an actuator's own motion: a constant, its direction, and its distance.
+
+        Parameters
+        ----------
+        max_coefficients : int, default 500
+            Largest number of coefficients in all with which offsets depend on the targets of all
+            actuators; with more actuators, each offset depends on its own actuator's target only.
+
+        """
         first, last = problem.levels
         distance, width = last - first, last.shape[-1]
         direction = self._direction(problem)
@@ -171,7 +185,7 @@ class OffsetFeatures:
             return torch.ones_like(last)[..., None]
         own = torch.stack([torch.ones_like(last), direction, distance / self.travel], dim=-1)
         pose = (last - self.centre) / self.spread
-        if width * (OWN_FEATURES + width) > MAX_COEFFICIENTS:
+        if width * (own.shape[-1] + width) > max_coefficients:
             return torch.cat([own, pose[..., None]], dim=-1)
         every = pose[:, :, None].expand(*pose.shape, width)
         # An actuator's own target first: coefficients of a kind share a variance.

@@ -10,12 +10,10 @@ import torch
 from torch import Tensor
 
 from retwin.data.segments import Segments
-from retwin.inference.losses import Tukey
-from retwin.inference.noise import Noise, common_rounding, correlation_time
+from retwin.inference.noise import Noise, Tukey, common_rounding, correlation_time
 from retwin.inference.solver import Bounds
-from retwin.update.corrections.delays import DelayProblem, delay_bounds
+from retwin.update.corrections.delays import DelayProblem, Knots, delay_bounds, interpolate, within
 from retwin.update.corrections.sampled_sensor import lattice_step
-from retwin.update.corrections.warp import Knots, interpolate, within
 
 MAX_STEP = 1 / 7
 """Largest change of a delay in one step, in widths of its range: the path is only piecewise smooth
@@ -23,8 +21,6 @@ in it."""
 AROUND = (1 / 7, 2 / 7)
 """Time before and after a motion that counts as motion, in widths of the range of delays: its
 timing is not exactly known."""
-MAX_CORRELATION = 0.999
-"""Largest lag-one autocorrelation of residuals: slow drift makes nearly all samples one."""
 SINGLE = torch.finfo(torch.float32).eps
 """Relative distance of neighbouring numbers in single precision."""
 
@@ -158,10 +154,16 @@ class PathProblem(DelayProblem):
         values = torch.where(there, (self.observed - self.path)[:, None], torch.nan)
         return torch.nan_to_num(torch.nanmedian(values, dim=2).values)
 
-    def noise(self, residual: Tensor) -> Noise:
+    def noise(self, residual: Tensor, *, max_correlation: float = 0.999) -> Noise:
         """Tukey's noise of every trajectory: its median residual in motion and at rest.
 
         The model is always worse in motion than at rest; one scale would give motion no weight.
+
+        Parameters
+        ----------
+        max_correlation : float, default 0.999
+            Largest lag-one autocorrelation of residuals: slow drift makes nearly all samples one.
+
         """
         length = residual.norm(dim=-1)
         extent = length.amax(dim=1).clamp_min(1e-9)
@@ -175,7 +177,7 @@ class PathProblem(DelayProblem):
         scale = torch.stack([rest, scales[0].maximum(rest)], dim=1).flatten()[:, None]
         noise = Noise(scale, torch.ones_like(scale[:, 0]), Tukey())
         kept = residual * noise.precision(self, residual).sqrt()
-        time = correlation_time(kept, self.measured, rows=True, limit=MAX_CORRELATION)
+        time = correlation_time(kept, self.measured, rows=True, limit=max_correlation)
         # Samples at rest are all rounded the same way, unless their noise is as large.
         common = common_rounding(scales[1].square(), self.rounding**2) / rest.square()
         same = common * (self.measured * ~moving).sum(dim=1)

@@ -17,31 +17,24 @@ from retwin.update.corrections.commands.effective_commands import (
     effective_commands,
 )
 from retwin.update.corrections.correction import Context, DifferentiableTwin
-from retwin.update.corrections.delays import DelayProblem, delay_bounds
+from retwin.update.corrections.delays import (
+    DelayProblem,
+    delay_bounds,
+    gather_samples,
+    interpolate,
+    thinned,
+    within,
+)
 from retwin.update.corrections.sampled_sensor import lattice_step
 from retwin.update.corrections.surrogate_slopes import differences, outputs_at, slopes_at
-from retwin.update.corrections.warp import gather_samples, interpolate, thinned, within
 from retwin.update.kernels.generation import linearised_outputs
 
-SURROGATE_STEP = 0.05
-"""Step of finite differences of delays through a surrogate with memory, in samples: larger than the
-rounding of single precision."""
 COMMAND_STEP = 1e-4
 """Step of finite differences through the effective commands, which are piecewise linear in x."""
-SETTLING = 0.5
-"""Time after the end of a command's ramp in which an output may still be in motion, in largest
-delays."""
 COMMON_ERROR = 0.25
 """Variance of the error that all samples of a segment have in common, relative to that of one
 sample: what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
 resolution. Outputs cannot tell it from an offset, so it is no estimate."""
-SAMPLES_OF_HALVES = 4
-"""Samples at least of a rest whose halves are compared."""
-HYPERPRIOR_RESTS = 2.0
-"""Rests without any creep that are assumed besides those measured."""
-LARGE_ERROR = 2.0
-"""Error of the surrogate, in that of half of the samples, beyond which nothing is learned from a
-segment but its own z."""
 GAIN_STEP = 5e-3
 """Step of the finite differences of the gain, in standard deviations of a command."""
 TRAJECTORIES_PER_BATCH = 64
@@ -122,11 +115,19 @@ class CommandProblem(DelayProblem):
         delay_range: tuple[float, float],
         max_samples: int,
         unit: Tensor | None = None,
+        settling_delays: float = 0.5,
     ) -> CommandProblem:
         """The problem of outputs (n, T, d_y) that were measured where `mask` is True.
 
         Only samples at which all outputs were measured are used, `max_samples` of each trajectory
         at most. By default the unit is that in which the outputs' standard deviation is 1.
+
+        Parameters
+        ----------
+        settling_delays : float, default 0.5
+            Time after the end of a command's ramp in which an output may still be in motion, in
+            largest delays.
+
         """
         segments = context.segments
         start = torch.as_tensor(segments.start)[..., None]
@@ -137,7 +138,7 @@ class CommandProblem(DelayProblem):
         unit = _unit(context, observed.double()[whole]) if unit is None else unit
         steps = [lattice_step(each) for each in observed.double()[whole].numpy().T]
         values = torch.where(whole[..., None], observed.double(), 0.0)
-        settling = SETTLING * max(delay_range[1], 0.0)
+        settling = settling_delays * max(delay_range[1], 0.0)
         near = within(sample, segments.start + delay_range[0], segments.settle + settling)
         healthy = valid[..., None] & ~bent & (start < context.frozen[:, None])
         problem = cls(
@@ -203,7 +204,9 @@ class CommandProblem(DelayProblem):
             return self
         variance = self.common.variance.mean(dim=-1)
         known = (self.measured > 0) & (self.common.block > 0)
-        limit = LARGE_ERROR**2 * variance[known].median() if known.any() else torch.inf
+        # Error of the surrogate, in that of half of the samples, beyond which nothing is learned
+        # from a segment but its own z.
+        limit = 2.0**2 * variance[known].median() if known.any() else torch.inf
         return replace(self, common=None, measured=self.measured * (variance <= limit))
 
     @property
@@ -247,12 +250,18 @@ class CommandProblem(DelayProblem):
             floor=floor,
         )
 
-    def creep(self, noise: Noise, residual: Tensor) -> float:
+    def creep(self, noise: Noise, residual: Tensor, *, samples_of_halves: int = 4) -> float:
         """Samples of a rest per independent one if actuators creep.
 
         A random walk ends as far from its mean as the means of its halves are apart: by a variance
         that all samples have in common. The residual is (n, S, d_y); what independent errors
         explain of the distance of these means is no creep.
+
+        Parameters
+        ----------
+        samples_of_halves : int, default 4
+            Samples at least of a rest whose halves are compared.
+
         """
         rest = self.inside * (self.group == 0)[:, None]
         count = rest.sum(dim=-1)
@@ -263,8 +272,9 @@ class CommandProblem(DelayProblem):
             weight.append(half.sum(dim=-1).clamp_min(1e-12))
             means.append(half @ residual / weight[-1][..., None])
         apart = ((means[0] - means[1]).square() / noise.scale[0].square()).mean(dim=-1)
-        excess = (apart - 1 / weight[0] - 1 / weight[1])[count >= SAMPLES_OF_HALVES]
-        common = COMMON_ERROR + max(0.0, float(excess.sum()) / (len(excess) + HYPERPRIOR_RESTS))
+        excess = (apart - 1 / weight[0] - 1 / weight[1])[count >= samples_of_halves]
+        # Rests without any creep that are assumed besides those measured.
+        common = COMMON_ERROR + max(0.0, float(excess.sum()) / (len(excess) + 2.0))
         return 1 + common * float(count.sum()) / max(1.0, float(self.valid.sum()))
 
     @property
@@ -369,7 +379,9 @@ class CommandProblem(DelayProblem):
     def _linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if self.memory:
             residual = self._residual(x)
-            delay = torch.full((self.size - len(self.spread),), SURROGATE_STEP)
+            # Step of finite differences of delays through a surrogate with memory, in samples:
+            # larger than the rounding of single precision.
+            delay = torch.full((self.size - len(self.spread),), 0.05)
             step = torch.cat([delay[:1], GAIN_STEP * self.spread, delay[1:]])
             moves = torch.diag(step.to(x).repeat(self.missed.shape[1]))
             columns = [(residual - self._residual(x + each)) / each.sum() for each in moves]

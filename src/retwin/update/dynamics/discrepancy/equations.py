@@ -34,8 +34,6 @@ __all__ = ["CorrectedEquations", "correctable", "differentiate", "variable_names
 
 LINEAR = {"variable", "constant", "add", "sub", "neg"}
 """Operations of an equation that only defines a state."""
-COMPARED = 5000
-"""Number of samples at which terms are compared."""
 DISTINCT = 1e-5
 """Norm of what a term of norm 1 has beyond others, below which it is a combination of them."""
 ABSORBED = 1e-3
@@ -349,7 +347,8 @@ class CorrectedEquations:
 def _some(states: NDArray, commands: NDArray) -> tuple[NDArray, NDArray]:
     """At most so many samples (K, d_x) and (K, d_u) of states and commands."""
     x, u = (each.reshape(np.prod(each.shape[:2]), each.shape[2]) for each in (states, commands))
-    some = np.linspace(0, len(x) - 1, min(len(x), COMPARED)).astype(int)
+    # Number of samples at which terms are compared.
+    some = np.linspace(0, len(x) - 1, min(len(x), 5000)).astype(int)
     return x[some], u[some]
 
 
@@ -419,13 +418,9 @@ def correctable(twin: StateTwin, wanted: Sequence[str]) -> tuple[str, ...]:
     found = tuple(wanted) or tuple(
         name for i, name in enumerate(names) if not _is_definition(twin, i)
     )
-    require(
-        found,
-        "states",
-        expected="a state equation that can be wrong",
-        got="equations without parameters and commands",
-        remedy="name the states whose equations are to be corrected",
-    )
+    got = "equations without parameters and commands"
+    remedy = "name the states whose equations are to be corrected"
+    require(found, "states", expected="a state equation that can be wrong", got=got, remedy=remedy)
     return found
 
 

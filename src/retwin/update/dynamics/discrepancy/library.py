@@ -23,13 +23,8 @@ WIDTH = 0.05
 WIDTHS = (-4.0, 3.0)
 """Bounds of the logarithm of its ratio to the usual one: from a thousandth of the half range to all
 of it."""
-SHIFT = 0.2
-"""Usual distance of a hinge from its knot, in half ranges of its variable: half of that between two
-knots."""
 SHIFTS = (-2.0, 2.0)
 """Bounds of its ratio to the usual one: those of the next knots."""
-MAX_MONOMIALS = 200
-"""Number of monomials of an equation above which their degree is lowered."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +61,11 @@ class Library:
         whole("degree", self.degree, at_least=0)
         one_of("friction", self.friction, (True, False))
         one_of("sticking", self.sticking, (True, False))
-        require(
-            all(0 <= knot <= 1 for knot in self.knots),
-            "knots",
-            expected="places from 0 to 1, the end of the range in calibration",
-            got=", ".join(f"{knot:g}" for knot in self.knots),
-            remedy="a hinge outside that range is not determined by the data",
-        )
+        inside = all(0 <= knot <= 1 for knot in self.knots)
+        expected = "places from 0 to 1, the end of the range in calibration"
+        got = ", ".join(f"{knot:g}" for knot in self.knots)
+        remedy = "a hinge outside that range is not determined by the data"
+        require(inside, "knots", expected=expected, got=got, remedy=remedy)
 
     @property
     def linear(self) -> bool:
@@ -99,7 +92,8 @@ class Library:
         """
         places = range(len(variables))
         degree = self.degree
-        while degree > 1 and comb(len(variables) + degree, degree) > MAX_MONOMIALS:
+        # Number of monomials of an equation above which their degree is lowered.
+        while degree > 1 and comb(len(variables) + degree, degree) > 200:
             degree -= 1
         found = [
             Term(
@@ -152,7 +146,9 @@ def _direction(chosen: Sequence[int], i: int) -> int | None:
 
 
 def _hinge(v: Sequence[Any], shift: Any = 0.0, *, i: int, sign: int, knot: float) -> Any:
-    return torch.relu(sign * v[i] - knot - SHIFT * shift)
+    # Usual distance of a hinge from its knot, in half ranges of its variable: half of that between
+    # two knots.
+    return torch.relu(sign * v[i] - knot - 0.2 * shift)
 
 
 def _sign(v: Sequence[Any], width: Any, i: int, zero: float) -> Any:

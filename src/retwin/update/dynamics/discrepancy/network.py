@@ -16,9 +16,6 @@ from retwin.update.dynamics.discrepancy.terms import WIDEST, Term
 
 __all__ = ["TanhNetwork"]
 
-STEEPNESS = 2.0
-"""Usual norm of the weights inside a unit: it passes from -1 to 1 within the domain."""
-
 
 @dataclass(frozen=True)
 class TanhNetwork:
@@ -59,7 +56,8 @@ class TanhNetwork:
         rng = np.random.default_rng(self.seed)
         made = Library(0, (), False).terms(variables, states, signs)
         for number in range(1, self.hidden + 1):
-            weights = STEEPNESS * rng.normal(size=len(variables)) / np.sqrt(len(variables))
+            # Usual norm of the weights inside a unit: it passes from -1 to 1 within the domain.
+            weights = 2.0 * rng.normal(size=len(variables)) / np.sqrt(len(variables))
             weights = np.where(signs, np.abs(weights) * signs, weights)
             bias = -float(weights @ rng.uniform(-1, 1, size=len(variables)))
             name = f"unit {number}"

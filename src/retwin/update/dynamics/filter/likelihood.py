@@ -20,8 +20,6 @@ from retwin.twins.compiled.model import Model
 from retwin.update.dynamics.filter.prediction import root_of, whitened
 from retwin.update.dynamics.twin import DynamicsTwin
 
-LANES = 8
-"""Variants that are computed at a time: numbers in a register of the widest processors."""
 COMPILED = 64
 """Number of models whose kernels are kept in this process."""
 
@@ -229,7 +227,8 @@ class Record:
 @lru_cache(maxsize=COMPILED)
 def _library(model: Model) -> ctypes.CDLL | None:
     """The kernel for a model; None without a C compiler."""
-    source = "\n".join([model.lanes_source(LANES), c_source(__package__, "likelihood.c")])
+    # Variants that are computed at a time: numbers in a register of the widest processors.
+    source = "\n".join([model.lanes_source(8), c_source(__package__, "likelihood.c")])
     return compiled(source, quiet=True)
 
 

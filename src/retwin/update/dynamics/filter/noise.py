@@ -21,9 +21,6 @@ __all__ = ["edges", "fit_noise", "folds", "needed_factor", "widening"]
 
 CERTAIN = 1.645
 """Standard errors between a quantile of held-out samples and its upper 95 % limit."""
-ENOUGH = 10_000
-"""Number of samples from which the likelihood is computed, unless one trajectory has more. They
-determine a variance to 1.4 %, and bands are scaled to all samples."""
 
 
 def fit_noise(
@@ -56,7 +53,9 @@ def fit_noise(
 
     """
     indices = np.array(corrected, dtype=int)
-    number = max(1, min(len(observed), ENOUGH // observed.steps))
+    # Number of samples from which the likelihood is computed, unless one trajectory has more. They
+    # determine a variance to 1.4 %, and bands are scaled to all samples.
+    number = max(1, min(len(observed), 10_000 // observed.steps))
     some = np.linspace(0, len(observed) - 1, number).round().astype(int)
     if not observed[some].mask.any(axis=(0, 1)).all():  # an output that few trajectories have
         some = np.arange(len(observed))

@@ -49,13 +49,9 @@ class Prediction:
     def quantile(self, level: ArrayLike) -> NDArray:
         """Quantiles of each output: (..., n, T, d_y) for levels (...)."""
         levels = np.asarray(level, dtype=float)
-        require(
-            ((levels > 0) & (levels < 1)).all(),
-            "level",
-            expected="probabilities between 0 and 1",
-            got=level,
-            remedy="give 0.95, not 95",
-        )
+        inside = ((levels > 0) & (levels < 1)).all()
+        expected = "probabilities between 0 and 1"
+        require(inside, "level", expected=expected, got=level, remedy="give 0.95, not 95")
         return self.mean + ndtri(levels[..., None, None, None]) * self.deviation
 
     def pit(self) -> NDArray:
