@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 ModelFolder = Annotated[Path, option("FOLDER", "Where to save the updated twin.")]
 RealSet = Annotated[list[Path], option("FILE", "Real records; may be repeated.")]
 StateEquations = Annotated[
-    bool, option("", "Correct the state equations, if clearly better.", "--dynamics")
+    bool, option("", "Correct the state equations, if better.", "--dynamics")
 ]
 Correction = Annotated[
     str | None,
