@@ -551,6 +551,22 @@ def test_a_correction_has_to_be_better_over_records(better: list[float], chosen:
     assert differences["simple"][0] > 0
 
 
+def test_a_correction_is_not_taken_because_it_is_as_good_as_another_one() -> None:
+    data = records(*range(6), slope=right)
+    noisy = np.array([0.4, 1.3, 0.4, 1.3, 0.4, 1.3])  # as good as either, since it differs so much
+    models = {
+        "simple": guess(data, np.ones(6)),
+        "noisy": guess(data, noisy),
+        "better": guess(data, 0.9 * np.ones(6)),
+    }
+    comparison = Comparison(data, folds_of(data), models)
+    chosen, differences = comparison.simplest()
+    assert abs(differences["noisy"][0]) < differences["noisy"][1]
+    assert chosen == "better"
+    del models["better"]
+    assert Comparison(data, folds_of(data), models).simplest()[0] == "simple"
+
+
 def test_a_record_that_two_parts_hold_counts_once() -> None:
     data = records(*range(6), slope=right)
     folds = folds_of(data)

@@ -262,7 +262,9 @@ def _print(found: Fitted, base: StandIn, out: Path, *, as_json: bool) -> None:
         if rows:
             shown += [f"{each.title}:", table(heads, rows, numbers=heads[1:]), ""]
     if found.parts and found.chosen == found.preferred:
-        shown.insert(2, "→ is the first within one standard error, or 2 %, of the best CRPS.")
+        shown.insert(
+            2, "→ is the simplest than which none is better by over a standard error, and 2 %."
+        )
     if found.parts:
         shown.insert(2, f"Errors are those of {found.how}.")
     figures, outputs = base.figures, found.records.outputs

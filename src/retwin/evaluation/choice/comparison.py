@@ -1,4 +1,4 @@
-"""Scores of candidates on the parts that each did not see, and the simplest of the best ones."""
+"""Scores of candidates on the parts that each did not see, and the simplest that is good enough."""
 
 from __future__ import annotations
 
@@ -224,9 +224,11 @@ class Comparison:
         return made
 
     def simplest(self) -> tuple[str, dict[str, tuple[float, float]]]:
-        """The simplest model within one standard error of the best one (Breiman et al., 1984).
+        """The simplest model than which none is clearly better, see `is_behind`.
 
-        A difference below HARDLY of the best score counts as none, too.
+        One after the other, a model takes the place of a simpler one where it is clearly better
+        than that: as in the rule of one standard error (Breiman et al., 1984), but a model that is
+        not better than a simpler one is not taken because it is as good as a third one.
 
         Returns
         -------
@@ -239,16 +241,21 @@ class Comparison:
         """
         scores = {name: self.independent_scores(name) for name in self.predicted}
         best = min(scores, key=lambda name: float(scores[name].mean()))
-        differences = {}
+        differences = {name: _difference(own, scores[best]) for name, own in scores.items()}
+        chosen = next(iter(scores))
         for name, own in scores.items():
-            change = own - scores[best]
-            error = change.std(ddof=1) / np.sqrt(len(change)) if len(change) > 1 else 0.0
-            differences[name] = float(change.mean()), float(error)
-        lowest = float(scores[best].mean())
-        chosen = next(name for name, own in differences.items() if not is_behind(*own, lowest))
+            if is_behind(*_difference(scores[chosen], own), float(own.mean())):
+                chosen = name
         return chosen, differences
 
 
-def is_behind(difference: float, error: float, best: float) -> bool:
-    """Whether a score differs from the best by more than a standard error, and than HARDLY."""
-    return difference > max(error, HARDLY * best)
+def _difference(scores: NDArray, others: NDArray) -> tuple[float, float]:
+    """Mean difference of scores (B,) from others, and its standard error."""
+    change = scores - others
+    error = change.std(ddof=1) / np.sqrt(len(change)) if len(change) > 1 else 0.0
+    return float(change.mean()), float(error)
+
+
+def is_behind(difference: float, error: float, other: float) -> bool:
+    """Whether a score is above another by more than a standard error, and than HARDLY of that."""
+    return difference > max(error, HARDLY * other)

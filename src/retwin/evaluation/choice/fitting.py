@@ -99,9 +99,9 @@ def fit(
     Candidates are the twin as it is, with identified parameters, with corrected state equations,
     with a delay and an offset per segment, with a residual of each output sample, and the last two
     in series, as far as the twin and the records allow. Each is fitted without each part of the
-    records in turn, and predicts it. The simplest is taken whose score (CRPS) is within one
-    standard error of the best one, or 2 %, and fitted to all records; its bands are calibrated by
-    its errors on the parts that were left out.
+    records in turn, and predicts it. One takes the place of a simpler one where its score
+    (CRPS) is lower by more than a standard error, and 2 %. The last one is fitted to all records;
+    its bands are calibrated by its errors on the parts that were left out.
 
     Parameters
     ----------
