@@ -38,7 +38,7 @@ def test_a_cause_is_written_with_its_time_size_and_probability_where_it_has_them
     nothing, alarm = (np.nan,) * 3, Alarm("tank", 3, 3.0, "level", "higher than predicted", 1e6, 3)
     named = {"leaking": 0.3, "Healthy": 0.7}
     none = Cause(alarm, "Healthy", 0.7, 0.9, nothing, nothing, named)
-    assert cause_text(vars(none), "") == "no known fault; probability 0.70"
+    assert cause_text(vars(none), "") == "no known fault; probability 0.70, or leaking (0.30)"
     leaking = Cause(alarm, "leaking", 0.7, 0.0, (0.2, 0.1, 0.3), (2.0, 1.0, 3.0), named, unit="1/s")
     assert (
         cause_text(vars(leaking), "2 s")
@@ -51,6 +51,10 @@ def test_a_cause_is_written_with_its_time_size_and_probability_where_it_has_them
     )
     unclear = replace(leaking, probability=0.4)
     assert cause_text(vars(unclear), "2 s").startswith("not clear, most likely leaking from 2 s;")
+    shares = {"Healthy": 0.0, "leaking": 0.45, "weak pump": 0.2, "stuck": 0.35}
+    alike = replace(unclear, probabilities=shares)
+    assert cause_text(vars(alike), "").endswith(", or weak pump (0.20), or stuck (0.35)")
+    assert ", or " not in cause_text(vars(replace(alike, probabilities={"weak pump": 0.19})), "")
     frozen = replace(leaking, size=nothing, unit="")
     assert cause_text(vars(frozen), "2 s") == "leaking from 2 s; probability 0.70"
 

@@ -102,10 +102,11 @@ class Cause:
         return self.probability * (1 - self.unknown) > PROBABLE
 
 
-def cause_text(cause: Mapping[str, Any], since: str) -> str:
+def cause_text(cause: Mapping[str, Any], since: str, *, rival: float = 0.2) -> str:
     """A cause with its onset, size and probability, and whether there is more to it.
 
     Of a `Cause` as a mapping, or of `cause_data`; `since` is its onset, "" where that is not known.
+    Others whose probability is at least `rival` are named: outputs may not tell them apart.
     """
     known = cause["name"] != HEALTHY  # else it explains the alarm best, which has no known cause
     more = cause["unknown"] > PROBABLE and known
@@ -120,7 +121,12 @@ def cause_text(cause: Mapping[str, Any], since: str) -> str:
     sized = value is not None and np.isfinite(value)
     size = f"size {value:.3g}{of} ({low:.3g} to {high:.3g}){end}, " if sized else ""
     among = " among the known causes" if more else ""
-    return f"{text}; {size}probability {cause['probability']:.2f}{among}"
+    rivals = [
+        f", or {other} ({share:.2f})"
+        for other, share in cause["probabilities"].items()
+        if share >= rival and other not in (cause["name"], HEALTHY)
+    ]
+    return f"{text}; {size}probability {cause['probability']:.2f}{among}{''.join(rivals)}"
 
 
 def size_unit(fault: Fault | None, twin: DynamicsTwin) -> str:
