@@ -1,7 +1,4 @@
-"""`retwin twin`: list, describe and simulate twins, and film what they do.
-
-Films of a trajectory, of `retwin twin simulate --film`: their settings, and the drawing.
-"""
+"""`retwin twin`: list, describe and simulate twins, and film what they do."""
 
 from __future__ import annotations
 

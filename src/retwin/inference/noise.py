@@ -5,7 +5,7 @@ Little and Taylor, J. Am. Stat. Assoc. 84, 881, 1989). Successive samples have c
 that fewer count than were measured: a first-order autoregression of coefficient ρ has (1 + ρ) /
 (1 - ρ) samples per independent one.
 
-Robust losses of a standardised residual: how much a sample costs, and how much it counts.
+A loss says how much a sample with a standardised residual costs, and how much it counts.
 """
 
 from __future__ import annotations

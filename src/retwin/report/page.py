@@ -1,8 +1,6 @@
 """The page: sections put into one self-contained HTML file, and the figures beside it.
 
-Explanations of terms, where they first occur in a section of the page.
-
-The explanations stand in `templates/glossary.json`.
+Terms are explained where they first occur in a section, by `templates/glossary.json`.
 """
 
 from __future__ import annotations

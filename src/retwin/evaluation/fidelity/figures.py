@@ -6,7 +6,7 @@ Some figures would not be at their ideal value even for a perfect generator, bec
 trajectories. For these, each of the twin's draws takes the place of the measured trajectory in
 turn, which gives the distribution under a perfect generator.
 
-`StoredArrays`: results that consist of arrays, written to an NPZ file and read from it.
+`StoredArrays`, which `Fidelity` is, writes results of arrays to an NPZ file and reads them.
 """
 
 from __future__ import annotations

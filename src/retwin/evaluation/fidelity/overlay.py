@@ -1,6 +1,6 @@
 """Each trajectory beside the predictive distribution of its commands without a fault.
 
-How pages show the components of z: delays in ms, though they are in samples inside.
+Components of z are shown as pages show them: delays in ms, though they are in samples inside.
 """
 
 from __future__ import annotations

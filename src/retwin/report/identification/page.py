@@ -1,6 +1,6 @@
 """`identification_page`: one self-contained HTML page about an identification.
 
-Figures of the page: estimates in their ranges, records before and after, residuals.
+Its figures are estimates in their ranges, records before and after, and residuals.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The discrepancy: what was observed of it, and what the corrected twins generate.
 
-Delay (TDe) and position error (TPE) in one segment of a trajectory (the paper's figure 2).
+One figure is of a single segment: its delay (TDe) and position error (TPE), as in the paper's
+figure 2.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> es
     each explains beyond those before it. They have a Gaussian prior about 0.
     """
     estimate.check_records(observed)
-    # Largest number of past samples that is tried.
+    # Up to four past samples are tried.
     orders = range(1, 5)
     # Highest degree of the monomials; it is lowered for many variables, see `Library`.
     order, found = estimate.best_order(

@@ -1,6 +1,6 @@
-"""Delays of segments, common to all problems that have one per segment: first values and limits.
+"""Delays of segments: first values and limits, and the time that they warp.
 
-Warped time: every segment is shifted by its own delay, what lies between is stretched to fit.
+Every segment is shifted by its own delay, and what lies between is stretched to fit.
 """
 
 from __future__ import annotations

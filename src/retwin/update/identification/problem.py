@@ -1,12 +1,10 @@
 """The posterior density on the unit box of parameters and scales of the noise.
 
-Summary statistics of measured outputs for the inference of parameters and noise.
-
-`Noise`: the distribution of the output error, white noise and a correlated discrepancy.
-
-The discrepancy is that of Kennedy and O'Hagan (2001), a Gaussian process on the output error: here
-an Ornstein-Uhlenbeck process over time (Matérn 1/2), independent for each trajectory and output. A
-Kalman filter integrates it out exactly, at a cost linear in the number of samples.
+`Noise` is the distribution of the output error, white noise and a correlated discrepancy, and
+`Summaries` are statistics of outputs by which both are inferred. The discrepancy is that of Kennedy
+and O'Hagan (2001), a Gaussian process on the output error: here an Ornstein-Uhlenbeck process over
+time (Matérn 1/2), independent for each trajectory and output. A Kalman filter integrates it out
+exactly, at a cost linear in the number of samples.
 """
 
 from __future__ import annotations
